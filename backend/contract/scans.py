@@ -1,0 +1,159 @@
+"""The state of a scan, whole: every request that changes a scan answers with it."""
+
+from datetime import datetime
+from typing import Any
+
+from backend.contract.base import Message
+from backend.domain.states import JobStatus, Level, StageStatus, Verdict
+
+
+class ArtifactRef(Message):
+    """An array in the store; fetch it at `/api/artifacts/{hash}`."""
+
+    hash: str
+    shape: tuple[int, ...]
+    dtype: str
+
+
+class FrameRef(Message):
+    """One captured frame of a result."""
+
+    camera: str
+    pattern: dict[str, Any]
+    exposure_ms: float | None
+    gain_db: float
+    role: str
+    bit_depth: int
+    image: ArtifactRef
+
+
+class FieldView(Message):
+    """One shown field of a finished stage."""
+
+    name: str
+    hint: dict[str, Any]
+    per_camera: bool
+    value: Any = None
+    """Numbers, texts, tables: the thing itself, as JSON. Per camera: a mapping."""
+    arrays: dict[str, ArtifactRef] = {}
+    """Arrays: under the camera's name if per camera, else under ``""``."""
+    frames: tuple[FrameRef, ...] = ()
+
+
+class CheckView(Message):
+    """One finding about a result."""
+
+    name: str
+    level: Level
+    sentence: str
+    value: float | None
+    limit: float | None
+    unit: str
+
+
+class SettingView(Message):
+    """One setting's present value and where it comes from."""
+
+    value: Any
+    source: str
+    """`default`, `preset`, `recipe` or `edited`."""
+    chosen: Any = None
+    """What the stage chose where the value is None (automatic) and a result exists."""
+
+
+class DecisionView(Message):
+    """The last decision on the present result."""
+
+    verdict: Verdict
+    reason: str
+    who: str
+    when: datetime
+
+
+class StageState(Message):
+    """One stage of a scan."""
+
+    name: str
+    title: str
+    status: StageStatus
+    message: str
+    """One sentence: what is missing, what failed, what the result says."""
+    key: str | None
+    """Today's key; None while an input isn't known yet."""
+    stage_run: str | None
+    """Id of the finished (or failed) run with today's key."""
+    take: int
+    settings: dict[str, SettingView]
+    checks: tuple[CheckView, ...] = ()
+    fields: tuple[FieldView, ...] = ()
+    decision: DecisionView | None = None
+    duration_s: float | None = None
+    started: datetime | None = None
+    result_hash: str | None = None
+
+
+class JobView(Message):
+    """The job that runs, or the last one."""
+
+    id: str
+    status: JobStatus
+    stage: str | None
+    """The stage it is at."""
+    progress: float
+    """Share of the stage done, 0..1."""
+    text: str
+    remaining_s: float | None
+    """Estimate for the stage; None where there is none."""
+    error: str | None
+    who: str
+
+
+class ScanSummary(Message):
+    """One line of the scan list."""
+
+    id: str
+    name: str
+    method: str
+    rig: str
+    created: datetime
+    who: str
+    status: str
+    """`running`, `awaiting_review`, `failed`, `done` or `idle`."""
+    stages_done: int
+    stages: int
+    points: int | None = None
+    """Number of points of the last cloud, if there is one."""
+
+
+class ScanState(Message):
+    """Everything about a scan that a screen needs, but the arrays."""
+
+    id: str
+    name: str
+    note: str
+    method: str
+    rig: str
+    rig_options: dict[str, Any]
+    created: datetime
+    who: str
+    revision: int
+    """Number of the last edit; sent back with an edit, so that a stale one is noticed."""
+    preset: str | None
+    status: str
+    stages: tuple[StageState, ...]
+    job: JobView | None
+    undo: str | None
+    """What undo would take back, as a sentence; None if there is nothing."""
+
+
+class AuditEntry(Message):
+    """One line of the audit trail: who did what, when, why."""
+
+    sequence: int
+    when: datetime
+    who: str
+    action: str
+    """`created`, `edited`, `undone`, `redone`, `accepted`, `rejected`, `run`, `cancelled`, `finished`, `failed`, `imported`, `exported`..."""
+    stage: str | None
+    sentence: str
+    details: dict[str, Any]

@@ -1,0 +1,49 @@
+"""What a stage says about the quality of its own result."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from backend.domain.states import Level
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding: a value against a limit, and a sentence for the operator."""
+
+    name: str
+    level: Level
+    sentence: str
+    value: float | None = None
+    limit: float | None = None
+    unit: str = ""
+
+
+CheckFunction = Callable[[Any, Any], Check]
+"""A pure function of (result, settings)."""
+
+
+def at_least(
+    name: str, value: float, *, warning: float, failure: float, sentence: str, unit: str = ""
+) -> Check:
+    """Grade a value that should be large: below `failure` it fails, below `warning` it warns."""
+    level = Level.FAILURE if value < failure else Level.WARNING if value < warning else Level.OK
+    return Check(
+        name, level, sentence, float(value), failure if level is Level.FAILURE else warning, unit
+    )
+
+
+def at_most(
+    name: str, value: float, *, warning: float, failure: float, sentence: str, unit: str = ""
+) -> Check:
+    """Grade a value that should be small: above `failure` it fails, above `warning` it warns."""
+    level = Level.FAILURE if value > failure else Level.WARNING if value > warning else Level.OK
+    return Check(
+        name, level, sentence, float(value), failure if level is Level.FAILURE else warning, unit
+    )
+
+
+def worst(checks: tuple[Check, ...]) -> Level:
+    """Return the gravest level among the checks, ok if there are none."""
+    order = [Level.OK, Level.WARNING, Level.FAILURE]
+    return max((check.level for check in checks), key=order.index, default=Level.OK)

@@ -1,0 +1,85 @@
+"""A method is a table of contents: its stages in order, wired by the types they read and make."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from backend.domain.rig import RigCalibration, RigFacts
+from backend.domain.stage import Input, Stage
+
+
+@dataclass(frozen=True)
+class Wire:
+    """Where one input of a stage comes from."""
+
+    input: Input
+    source: str | None
+    """Name of the stage that makes it; None: it is given with the scan, or missing."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A measuring method: name, title, stages, and what is given from outside."""
+
+    name: str
+    title: str
+    stages: tuple[Stage, ...]
+    given: tuple[type, ...] = (RigFacts, RigCalibration)
+    doc: str = ""
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Named sets of settings: `{"fast": {"exposures.budget": "fast"}}`."""
+
+    def __post_init__(self) -> None:
+        """Refuse, at import, names used twice and inputs that nothing can make."""
+        names = [s.name for s in self.stages]
+        if twice := sorted({n for n in names if names.count(n) > 1}):
+            raise TypeError(f"method {self.name!r} lists {twice} twice: use stage.named(...)")
+        for s in self.stages:
+            self._wire(s)
+
+    @cached_property
+    def wires(self) -> Mapping[str, tuple[Wire, ...]]:
+        """For each stage, where its inputs come from."""
+        return {s.name: self._wire(s) for s in self.stages}
+
+    def stage(self, name: str) -> Stage:
+        """Return the stage of that name; KeyError if there is none."""
+        for s in self.stages:
+            if s.name == name:
+                return s
+        raise KeyError(name)
+
+    def type_named(self, name: str) -> type:
+        """Return the result type (made or given) of that name; KeyError if there is none."""
+        types = [*self.given, *(s.output for s in self.stages)]
+        for t in types:
+            if t.__name__ == name:
+                return t
+        raise KeyError(name)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the method's description as JSON values."""
+        return {
+            "name": self.name,
+            "title": self.title,
+            "doc": self.doc,
+            "stages": [s.describe() for s in self.stages],
+            "given": [t.__name__ for t in self.given],
+            "presets": {name: dict(values) for name, values in self.presets.items()},
+        }
+
+    def _wire(self, reader: Stage) -> tuple[Wire, ...]:
+        earlier = self.stages[: self.stages.index(reader)]
+        return tuple(self._wire_input(reader, i, earlier) for i in reader.inputs)
+
+    def _wire_input(self, reader: Stage, wanted: Input, earlier: tuple[Stage, ...]) -> Wire:
+        makers = [s for s in earlier if s.output is wanted.type]
+        if makers:
+            return Wire(wanted, makers[-1].name)
+        if wanted.type in self.given or wanted.optional:
+            return Wire(wanted, None)
+        raise TypeError(
+            f"method {self.name!r}: stage {reader.name!r} reads {wanted.name!r}, a {wanted.type.__name__}, "
+            f"which no earlier stage makes and which isn't given"
+        )
