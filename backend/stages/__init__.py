@@ -1,0 +1,1 @@
+"""One file per stage: settings, result, function. A stage knows no rig, no storage and no HTTP."""
