@@ -145,10 +145,7 @@ def smoothed(
     if sigma_gray <= 0:
         return counts.astype(np.float64)
     sigma_bins = sigma_gray * (counts.size - 1) / 255.0
-    smooth: Float[np.ndarray, "gray"] = gaussian_filter1d(
-        counts.astype(np.float64), sigma_bins, mode="reflect"
-    )
-    return smooth
+    return np.asarray(gaussian_filter1d(counts.astype(np.float64), sigma_bins, mode="reflect"))
 
 
 def foreground_range(counts: Float[np.ndarray, "gray"]) -> tuple[int, int]:

@@ -1,5 +1,6 @@
 """Brightness zones: peaks and valleys of a scene's gray-level histogram."""
 
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -66,10 +67,8 @@ class _Curve(NamedTuple):
         if self.polynomial is None:
             return self.height * np.exp(-0.5 * ((gray - self.peak) / self.sigma) ** 2)
         inside = (gray >= self.first) & (gray <= self.last)
-        values: Float[np.ndarray, "n"] = np.where(
-            inside, np.maximum(self.polynomial(np.clip(gray, self.first, self.last)), 0.0), 0.0
-        )
-        return values
+        values = self.polynomial(np.clip(gray, self.first, self.last))
+        return np.where(inside, np.maximum(values, 0.0), 0.0)
 
 
 _Group = tuple[int, int]
@@ -131,7 +130,7 @@ def find_zones(
     groups = _all_groups(histogram, counts, first, last, settings)
     curves = [_fit(histogram, group, settings.fit) for group in groups]
     curves = _merged(histogram, curves, settings, black_gray)
-    inner = [_valley(a, b, histogram) for a, b in zip(curves, curves[1:], strict=False)]
+    inner = [_valley(a, b, histogram) for a, b in pairwise(curves)]
     valleys = np.array([float(first), *inner, float(last)])
     return _zone_fit(counts, histogram, curves, valleys)
 
@@ -180,7 +179,7 @@ def zones_from_valleys(
             (int(np.ceil(low)), max(int(np.floor(high)), int(np.ceil(low)))),
             settings.fit,
         )
-        for low, high in zip(valleys_gray[:-1], valleys_gray[1:], strict=True)
+        for low, high in pairwise(valleys_gray)
     ]
     return _zone_fit(counts, histogram, curves, valleys_gray.astype(np.float64))
 
@@ -195,8 +194,7 @@ def zone_shares(
     cumulative = np.concatenate([[0.0], np.cumsum(counts)])
     upper = np.clip(np.floor(valleys_gray).astype(np.int64) + 1, 0, counts.size)
     upper[0] = np.clip(int(np.ceil(valleys_gray[0])), 0, counts.size)
-    shares: Float[np.ndarray, "zone"] = np.diff(cumulative[upper]) / max(cumulative[-1], 1.0)
-    return shares
+    return np.asarray(np.diff(cumulative[upper]) / max(cumulative[-1], 1.0))
 
 
 def _check_valleys(valleys_gray: Float[np.ndarray, "valley"], full_scale: int) -> None:
