@@ -208,7 +208,9 @@ def saturated_share(exposed: Exposed, facts: RigFacts) -> float:
 
 def _share(frame: Frame, facts: CameraFacts) -> float:
     gray = frame.gray
-    lit = np.count_nonzero(gray > facts.black_level_gray + 3.0 * max(1.0, _read_noise_gray(facts)))
+    lit = int(
+        np.count_nonzero(gray > facts.black_level_gray + 3.0 * max(1.0, _read_noise_gray(facts)))
+    )
     return float(np.count_nonzero(gray >= facts.full_scale_gray - 1)) / max(lit, 1)
 
 
