@@ -6,7 +6,7 @@ undo, partial re-capture and replay one mechanism: driving the plan again with j
 
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from backend.domain.frames import Frame, Pixels
 from backend.domain.patterns import Pattern
@@ -48,6 +48,7 @@ Plan = Generator[Burst | Until, tuple[Exposed, ...], T]
 """Yields bursts, receives one `Exposed` per shot (a single one after `Until`), returns what it learnt."""
 
 
+@runtime_checkable
 class Shoot(Protocol):
     """Drives a plan on the rig (or from the journal) and returns what the plan returns.
 
@@ -60,6 +61,7 @@ class Shoot(Protocol):
         ...
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Tells how far a stage is; raises `CancelledError` when the operator has cancelled."""
 
