@@ -1,10 +1,11 @@
 """A method is a table of contents: its stages in order, wired by the types they read and make."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from backend.domain.frames import Frame
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.stage import Input, Stage
 
@@ -29,12 +30,19 @@ class Method:
     doc: str = ""
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Named sets of settings: `{"fast": {"exposures.budget": "fast"}}`."""
+    importers: Mapping[str, Callable[[tuple[Frame, ...]], Any]] = field(default_factory=dict)
+    """How imported frames become the result of a capturing stage: `{stage: function of frames}`.
+    Frames that name no stage belong to the first one."""
 
     def __post_init__(self) -> None:
         """Refuse, at import, names used twice and inputs that nothing can make."""
         names = [s.name for s in self.stages]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise TypeError(f"method {self.name!r} lists {twice} twice: use stage.named(...)")
+        if unknown := sorted(set(self.importers) - set(names)):
+            raise TypeError(
+                f"method {self.name!r} imports frames for {unknown}, which it doesn't list"
+            )
         for s in self.stages:
             self._wire(s)
 
