@@ -1,0 +1,50 @@
+"""The audit trail: a table that only grows."""
+
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from backend.storage import tables
+from backend.storage.repositories.conversion import as_row
+from backend.storage.rows import AuditRow
+
+
+class AuditTrail:
+    """Who did what to a scan, when and why."""
+
+    def __init__(self, session: Session, now: Callable[[], datetime]) -> None:
+        self._session = session
+        self._now = now
+
+    def add(
+        self,
+        scan: str,
+        who: str,
+        action: str,
+        stage: str | None,
+        sentence: str,
+        details: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Append a line."""
+        self._session.add(
+            tables.Audit(
+                scan=scan,
+                when=self._now(),
+                who=who,
+                action=action,
+                stage=stage,
+                sentence=sentence,
+                details=dict(details or {}),
+            )
+        )
+        self._session.flush()
+
+    def of(self, scan: str) -> list[AuditRow]:
+        """Return the scan's lines, oldest first."""
+        query = (
+            select(tables.Audit).where(tables.Audit.scan == scan).order_by(tables.Audit.sequence)
+        )
+        return [as_row(AuditRow, record) for record in self._session.scalars(query)]
