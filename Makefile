@@ -11,6 +11,7 @@ JOBS ?= auto
 # Whoever has the development packages keeps them up to date, also for the demo.
 ENVIRONMENT := $(if $(wildcard $(VENV)/.python-dev),$(VENV)/.python-dev,$(VENV)/.python-run)
 
+.NOTPARALLEL:
 .PHONY: help demo test lint format bench lock
 
 help:
