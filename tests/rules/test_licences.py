@@ -13,13 +13,12 @@ LICENCE_NOT_IN_METADATA: dict[str, str] = {}
 """Package -> its licence, read in its source, if the metadata don't say."""
 
 
-def licence(distribution: metadata.PackageMetadata) -> str:
-    """Return all that a distribution says of its licence, the body of a licence text cut off."""
-    classifiers = [
-        c for c in distribution.get_all("Classifier") or [] if c.startswith("License ::")
-    ]
-    first_line = (distribution.get("License") or "").strip().split("\n")[0]
-    said = [distribution.get("License-Expression") or "", first_line, *classifiers]
+def licence(package: str) -> str:
+    """Return all that a package says of its licence, the body of a licence text cut off."""
+    fields = metadata.metadata(package)
+    classifiers = [c for c in fields.get_all("Classifier") or [] if c.startswith("License ::")]
+    texts = (fields.get_all("License-Expression") or []) + (fields.get_all("License") or [])
+    said = [*(text.strip().split("\n")[0] for text in texts), *classifiers]
     return "; ".join(s for s in said if s and s != "UNKNOWN")
 
 
