@@ -1,0 +1,181 @@
+"""The pinhole camera with lens distortion, as OpenCV models it: pixels to rays and back."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from backend.numerics.errors import CalibrationError
+from backend.numerics.lattice import Lattice, lattice_positions
+
+_DISTORTION_SIZES = (0, 4, 5, 8, 12, 14)
+_UNDISTORT_STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+_ROUND_TRIP_PX = 0.01
+
+
+class Pinhole(NamedTuple):
+    """A camera, or a projector as an inverse camera; pixel centres at integers."""
+
+    K: Float[np.ndarray, "3 3"]
+    """Intrinsic matrix in [px]."""
+    distortion: Float[np.ndarray, "_n"]
+    """k1 k2 p1 p2 k3 ... in OpenCV's order, 0, 4, 5, 8, 12 or 14 of them."""
+    width_px: int
+    height_px: int
+
+
+class RigidTransform(NamedTuple):
+    """x_to = R x_from + t."""
+
+    R: Float[np.ndarray, "3 3"]
+    t_mm: Float[np.ndarray, "3"]
+
+
+def check_pinhole(camera: Pinhole, name: str) -> None:
+    """Refuse a camera model that can't be used.
+
+    Raises
+    ------
+    CalibrationError
+        If a number isn't finite, the matrix is singular or no intrinsic matrix, the picture
+        is empty, or the number of distortion coefficients is none of OpenCV's.
+    """
+    if not (np.isfinite(camera.K).all() and np.isfinite(camera.distortion).all()):
+        raise CalibrationError(
+            f"the calibration of {name} holds numbers that aren't finite; calibrate again"
+        )
+    upper = camera.K[2, 0] == camera.K[2, 1] == camera.K[1, 0] == 0 and camera.K[2, 2] == 1
+    if not (upper and camera.K[0, 0] > 0 and camera.K[1, 1] > 0):
+        raise CalibrationError(
+            f"the intrinsic matrix of {name} is {camera.K.tolist()}; it needs positive focal lengths"
+            " and the last row 0 0 1"
+        )
+    if camera.distortion.size not in _DISTORTION_SIZES:
+        raise CalibrationError(
+            f"{name} has {camera.distortion.size} distortion coefficients; OpenCV's models have"
+            f" {', '.join(map(str, _DISTORTION_SIZES))}"
+        )
+    if camera.width_px < 2 or camera.height_px < 2:
+        raise CalibrationError(
+            f"{name} is {camera.width_px}x{camera.height_px} px; give the size of its pictures"
+        )
+
+
+def check_transform(transform: RigidTransform, name: str) -> None:
+    """Refuse a pose whose matrix isn't a rotation or that isn't finite.
+
+    Raises
+    ------
+    CalibrationError
+        If so; orthogonality is checked to 1e-4, as calibration files are rounded.
+    """
+    finite = np.isfinite(transform.R).all() and np.isfinite(transform.t_mm).all()
+    if not finite or not np.allclose(transform.R @ transform.R.T, np.eye(3), atol=1e-4):
+        raise CalibrationError(
+            f"the pose of {name} isn't a rotation with a finite translation; calibrate again"
+        )
+    if np.linalg.det(transform.R) < 0:
+        raise CalibrationError(f"the pose of {name} mirrors (determinant -1); check its axes")
+
+
+def inverse(transform: RigidTransform) -> RigidTransform:
+    """Return a_from_b for b_from_a."""
+    return RigidTransform(transform.R.T, -transform.R.T @ transform.t_mm)
+
+
+def compose(c_from_b: RigidTransform, b_from_a: RigidTransform) -> RigidTransform:
+    """Return c_from_a."""
+    return RigidTransform(c_from_b.R @ b_from_a.R, c_from_b.R @ b_from_a.t_mm + c_from_b.t_mm)
+
+
+def rays(points_px: Float[np.ndarray, "n 2"], camera: Pinhole) -> Float[np.ndarray, "n 2"]:
+    """Return the undistorted ray (x/z, y/z) of each pixel position.
+
+    Parameters
+    ----------
+    points_px
+        Positions in the (distorted) picture in [px].
+    camera
+        Camera model.
+
+    Returns
+    -------
+    Ray slopes, float64; `project` of any point on the ray returns the position to 1e-9 px,
+    unless the distortion can't be inverted there.
+    """
+    if points_px.shape[0] == 0:
+        return np.empty((0, 2))
+    undistorted = cv2.undistortPointsIter(
+        np.ascontiguousarray(points_px, np.float64)[:, None, :],
+        camera.K,
+        camera.distortion,
+        np.eye(3),
+        np.eye(3),
+        _UNDISTORT_STOP,
+    )
+    return np.asarray(undistorted[:, 0, :], np.float64)
+
+
+def project(
+    points_mm: Float[np.ndarray, "n 3"],
+    camera: Pinhole,
+    camera_from_points: RigidTransform | None = None,
+) -> Float[np.ndarray, "n 2"]:
+    """Project points into the (distorted) picture.
+
+    Parameters
+    ----------
+    points_mm
+        Points in [mm], in the camera's frame or in the frame that `camera_from_points` maps from.
+    camera
+        Camera model.
+    camera_from_points
+        Pose; None means that the points are in the camera's frame.
+
+    Returns
+    -------
+    Positions in [px], float64. NaN for points that aren't in front of the camera.
+    """
+    if points_mm.shape[0] == 0:
+        return np.empty((0, 2))
+    points = points_mm.astype(np.float64)
+    if camera_from_points is not None:
+        points = points @ camera_from_points.R.T + camera_from_points.t_mm
+    pixels, _ = cv2.projectPoints(
+        np.ascontiguousarray(points)[:, None, :],
+        np.zeros(3),
+        np.zeros(3),
+        camera.K,
+        camera.distortion,
+    )
+    behind = ~(points[:, 2] > 0)
+    return np.where(behind[:, None], np.nan, np.asarray(pixels, np.float64)[:, 0, :])
+
+
+def ray_lattice(camera: Pinhole, name: str = "camera") -> Lattice:
+    """Sample the rays of a camera's pixels on a coarse lattice, for kernels and `Lattice.map`.
+
+    Returns
+    -------
+    Lattice of (x/z, y/z); interpolation is good to 1e-5 px for any lens that a
+    calibration can describe.
+
+    Raises
+    ------
+    CalibrationError
+        If the model can't be used or its distortion can't be inverted within the picture.
+    """
+    check_pinhole(camera, name)
+    x, y = lattice_positions(camera.width_px, camera.height_px)
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    slopes = rays(pixels, camera)
+    back = project(np.column_stack([slopes, np.ones(len(slopes))]), camera)
+    error = np.hypot(*(back - pixels).T)
+    if not np.max(error) < _ROUND_TRIP_PX:
+        raise CalibrationError(
+            f"the distortion of {name} can't be inverted over the whole picture (off by"
+            f" {np.max(error):.3g} px); calibrate again with corners near the picture's edges"
+        )
+    nodes = slopes.T.reshape(2, y.size, x.size)
+    return Lattice(np.ascontiguousarray(nodes), camera.width_px, camera.height_px)
