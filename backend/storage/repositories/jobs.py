@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Iterable
 from datetime import datetime
-from typing import TypedDict
+from typing import TypedDict, Unpack
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
-from typing_extensions import Unpack
 
 from backend.domain.errors import NotFoundError
 from backend.domain.states import JobStatus
