@@ -58,6 +58,8 @@ class Mask(Hint):
     labels: dict[int, str] = field(default_factory=dict)
     """Text of each label (or of each bit's value, with `bits`); 0 is drawn transparent if absent."""
     bits: bool = False
+    names: str | None = None
+    """Field with a text per label, the first for label 1, where the texts depend on the result."""
     edits: str | None = None
     """Setting that takes a painted mask."""
 

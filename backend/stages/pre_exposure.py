@@ -62,14 +62,14 @@ class Preview:
     histogram: Annotated[
         Float[np.ndarray, "gray"], Histogram("Gray levels, lit pixels of all cameras")
     ]
-    white: Annotated[Mapping[str, Integer[np.ndarray, "h w"]], Picture("White field", unit="gray")]
-    foreground: Annotated[Mapping[str, Bool[np.ndarray, "h w"]], Mask("Lit pixels", {1: "lit"})]
+    white: Annotated[Mapping[str, Integer[np.ndarray, "_h _w"]], Picture("White field", unit="gray")]
+    foreground: Annotated[Mapping[str, Bool[np.ndarray, "_h _w"]], Mask("Lit pixels", {1: "lit"})]
     rate_gray_per_ms: Annotated[
-        Mapping[str, Float[np.ndarray, "h w"]],
+        Mapping[str, Float[np.ndarray, "_h _w"]],
         Picture("Brightness", unit="gray/ms", colormap="inferno"),
     ]
     """Signal of the white field above dark per ms, from the longest unsaturated picture of each pixel."""
-    dark: Annotated[Mapping[str, Integer[np.ndarray, "h w"]], Picture("Black field", unit="gray")]
+    dark: Annotated[Mapping[str, Integer[np.ndarray, "_h _w"]], Picture("Black field", unit="gray")]
     dark_gray: Mapping[str, float]
     """Median of the black field."""
     ladder: Annotated[tuple[LadderStep, ...], Table("Exposures tried")]

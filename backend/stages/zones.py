@@ -65,7 +65,7 @@ class Zones:
     """zones + 1 borders: first and last foreground gray at the ends."""
     table: Annotated[tuple[ZoneRow, ...], Table("Zones")]
     zone_count: Annotated[int, Value("Zones")]
-    zone_map: Annotated[Mapping[str, UInt8[np.ndarray, "h w"]], Mask("Zone of each pixel")]
+    zone_map: Annotated[Mapping[str, UInt8[np.ndarray, "_h _w"]], Mask("Zone of each pixel")]
     """1 = darkest zone ..., 0 = background."""
 
 

@@ -1,0 +1,216 @@
+"""Fuse the exposures: per pixel one phasor for each frequency, from every picture that isn't saturated."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float32, UInt8, UInt16
+
+from backend.domain.checks import Check, at_most
+from backend.domain.errors import StageFailedError
+from backend.domain.hints import Mask, Picture, Value
+from backend.domain.params import Params, setting
+from backend.domain.patterns import Axis
+from backend.domain.rig import RigFacts
+from backend.domain.shots import Progress
+from backend.domain.stage import stage
+from backend.domain.states import Review
+from backend.numerics import phasors as numerics
+from backend.numerics.phasors import NO_EXPOSURE
+from backend.numerics.reasons import SENTENCES, Reason
+from backend.numerics.sine_code import SineCode
+from backend.numerics.uncertainty import NoiseModel
+from backend.stages.fringe_capture import FringeFrames
+from backend.stages.fringe_sets import FringeSet, fringe_sets
+from backend.stages.gray_orders import GrayPosition, gray_position
+from backend.stages.pre_exposure import Preview
+from backend.stages.zones import Zones, zone_of_pixels
+
+Strategy = Literal["weighted", "longest_unsaturated", "masks"]
+
+REASON_LABELS = {int(reason): sentence for reason, sentence in SENTENCES.items()}
+"""What each bit of a reasons map means, for the legend."""
+
+
+class FusionParams(Params):
+    """How the exposures of a pixel become one."""
+
+    strategy: Strategy = setting("weighted", title="Fusion")
+    """weighted: all unsaturated exposures by their noise; longest_unsaturated: one exposure per pixel;
+    masks: the zones decide (the paper's rule)."""
+    saturation_gray: float | None = setting(
+        None, title="Saturated from", unit="gray", ge=1, le=65535, advanced=True
+    )
+    """Automatic: full scale - 1."""
+    steps: int | None = setting(None, title="Steps used", ge=3, le=32, advanced=True)
+    """Use only so many of the captured steps, evenly spread; automatic: all of them."""
+    first_step: int = setting(0, title="First step used", ge=0, le=31, advanced=True)
+    """Which of the possible subsets of steps is used."""
+
+
+@dataclass(frozen=True)
+class AxisPhasors:
+    """One camera's phasors along one direction."""
+
+    camera: str
+    axis: Axis
+    periods: tuple[float, ...]
+    shifts_rad: tuple[tuple[float, ...], ...]
+    in_phase_gray: Float32[np.ndarray, "k h w"]
+    quadrature_gray: Float32[np.ndarray, "k h w"]
+    mean_gray: Float32[np.ndarray, "k h w"]
+    sigma_gray: Float32[np.ndarray, "h w"]
+    exposure_index: UInt8[np.ndarray, "h w"]
+    reasons: UInt16[np.ndarray, "h w"]
+    black_gray: float
+    gray: GrayPosition | None
+    """Coarse position from a Gray code, if one was projected."""
+
+    @property
+    def code(self) -> SineCode:
+        """Frequencies and steps."""
+        return SineCode(self.periods, self.shifts_rad)
+
+
+@dataclass(frozen=True)
+class Phasors:
+    """What all exposures together say of every pixel."""
+
+    sets: tuple[AxisPhasors, ...]
+    exposures_ms: tuple[float, ...]
+    exposure_names: tuple[str, ...]
+    exposure_map: Annotated[
+        Mapping[str, UInt8[np.ndarray, "_h _w"]], Mask("Exposure used", names="exposure_names")
+    ]
+    """1 = shortest exposure ..., 0 = none serves the pixel."""
+    fused: Annotated[
+        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Fused picture", unit="gray/ms", colormap="gray")
+    ]
+    modulation_gray: Annotated[
+        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Modulation", unit="gray", colormap="viridis")
+    ]
+    """Amplitude of the first frequency, in gray levels of the pixel's dominating exposure."""
+    reasons: Annotated[Mapping[str, UInt16[np.ndarray, "_h _w"]], Mask("Missing because", REASON_LABELS, bits=True)]
+    served_share: Annotated[float, Value("Pixels served")]
+    saturated_share: Annotated[float, Value("Saturated at every exposure")]
+
+
+def _not_saturated(result: Phasors, params: FusionParams) -> Check:
+    return at_most(
+        "saturation", result.saturated_share, warning=0.01, failure=0.9,
+        sentence=f"{result.saturated_share:.2%} of the pixels are saturated at every exposure",
+    )  # fmt: skip
+
+
+@stage(title="Fusion", version=1, review=Review.ON_WARNING, checks=(_not_saturated,))
+def fusion(
+    frames: FringeFrames,
+    preview: Preview | None,
+    zones: Zones | None,
+    facts: RigFacts,
+    params: FusionParams,
+    progress: Progress,
+) -> Phasors:
+    """Combine all exposures of each pixel, leaving out the saturated ones."""
+    sets = fringe_sets(frames.frames)
+    if params.steps is not None:
+        sets = tuple(s.subset(params.steps, params.first_step) for s in sets)
+    fused = []
+    for number, fringes in enumerate(sets):
+        progress(number / len(sets), f"camera {fringes.camera}, {fringes.axis}")
+        fused.append(_fuse(fringes, preview, zones, facts, params))
+    return _summarise(tuple(fused), sets[0].exposures_ms)
+
+
+def _fuse(
+    fringes: FringeSet,
+    preview: Preview | None,
+    zones: Zones | None,
+    facts: RigFacts,
+    params: FusionParams,
+) -> AxisPhasors:
+    noise = noise_model(fringes, facts)
+    code = SineCode(fringes.periods, fringes.shifts_rad)
+    full_scale_gray = 2.0**fringes.bit_depth - 1
+    saturation_gray = params.saturation_gray or full_scale_gray - 1
+    result = numerics.fuse_exposures(
+        [[f.gray for f in e.sines] for e in fringes.exposures],
+        code,
+        exposure_ms=fringes.exposures_ms,
+        noise=noise,
+        saturation_gray=saturation_gray,
+        strategy=params.strategy,
+        exposure_index=_zone_index(fringes, preview, zones) if params.strategy == "masks" else None,
+    )
+    return AxisPhasors(
+        camera=fringes.camera,
+        axis=fringes.axis,
+        periods=fringes.periods,
+        shifts_rad=fringes.shifts_rad,
+        in_phase_gray=result.in_phase_gray,
+        quadrature_gray=result.quadrature_gray,
+        mean_gray=result.mean_gray,
+        sigma_gray=result.sigma_gray,
+        exposure_index=result.exposure_index,
+        reasons=result.reasons,
+        black_gray=noise.black_gray,
+        gray=gray_position(fringes, facts, result.exposure_index, noise),
+    )
+
+
+def noise_model(fringes: FringeSet, facts: RigFacts) -> NoiseModel:
+    """Translate the facts of the camera that took the fringes."""
+    camera = facts.cameras[fringes.camera]
+    return NoiseModel.of_camera(
+        read_noise_e=camera.read_noise_e,
+        full_well_e=camera.full_well_e,
+        full_scale_gray=camera.full_scale_gray,
+        black_gray=camera.black_level_gray,
+        gain_db=fringes.gain_db,
+    )
+
+
+def _zone_index(
+    fringes: FringeSet, preview: Preview | None, zones: Zones | None
+) -> UInt8[np.ndarray, "h w"]:
+    """Give each zone its exposure: the darkest zone the longest (equation 16)."""
+    if preview is None or zones is None:
+        raise StageFailedError(
+            "Fusion by masks needs the preview and its zones, which this scan doesn't have: choose weighted fusion."
+        )
+    count = len(fringes.exposures)
+    if zones.zone_count != count:
+        raise StageFailedError(
+            f"Fusion by masks needs one exposure per zone, but there are {zones.zone_count} zones and {count} "
+            "exposures: choose the strategy 'hdrsia' for the exposures, or weighted fusion."
+        )
+    label = zone_of_pixels(
+        preview.white[fringes.camera], zones.valleys_gray, preview.foreground[fringes.camera]
+    )
+    exposure_of_zone = np.array([NO_EXPOSURE, *reversed(range(count))], dtype=np.uint8)
+    return exposure_of_zone[label]
+
+
+def _summarise(sets: tuple[AxisPhasors, ...], exposures_ms: tuple[float, ...]) -> Phasors:
+    first = {s.camera: s for s in reversed(sets)}
+    pixels = sum(s.reasons.size for s in first.values())
+    saturated = sum(int(np.count_nonzero(s.reasons & Reason.SATURATED)) for s in first.values())
+    served = sum(int(np.count_nonzero(s.exposure_index != NO_EXPOSURE)) for s in first.values())
+    times = np.array([*exposures_ms, *[1.0] * (256 - len(exposures_ms))], np.float32)
+    return Phasors(
+        sets=sets,
+        exposures_ms=exposures_ms,
+        exposure_names=tuple(f"{t:.4g} ms" for t in exposures_ms),
+        exposure_map={n: s.exposure_index + np.uint8(1) for n, s in first.items()},
+        fused={
+            n: np.maximum(s.mean_gray[0] - np.float32(s.black_gray), 0) / times[s.exposure_index]
+            for n, s in first.items()
+        },
+        modulation_gray={
+            n: np.hypot(s.in_phase_gray[0], s.quadrature_gray[0]) for n, s in first.items()
+        },
+        reasons={n: s.reasons for n, s in first.items()},
+        served_share=served / pixels,
+        saturated_share=saturated / pixels,
+    )
