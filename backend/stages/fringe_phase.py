@@ -20,7 +20,8 @@ from backend.numerics import fringe_orders
 from backend.numerics.fringe_orders import FringeOrders
 from backend.numerics.phasors import Phasors as FusedFrames
 from backend.numerics.reasons import Reason
-from backend.stages.fusion import REASON_LABELS, AxisPhasors, Phasors
+from backend.stages.cloud import REASON_LABELS
+from backend.stages.fusion import AxisPhasors, Phasors
 
 Unwrapping = Literal["maximum_likelihood", "cascade", "hierarchical", "gray_code"]
 
@@ -34,7 +35,12 @@ class FringePhaseParams(Params):
     modulation_min_gray: float = setting(4.0, title="Least modulation", unit="gray", ge=0, le=1000)
     """Amplitude of the fringes in gray levels of the exposure used."""
     residual_max_cycles: float | None = setting(
-        None, title="Largest contradiction", unit="cycles", ge=0.0005, le=0.5, auto="residual_max_cycles"
+        None,
+        title="Largest contradiction",
+        unit="cycles",
+        ge=0.0005,
+        le=0.5,
+        auto="residual_max_cycles",
     )
     """By how much the frequencies may disagree. Automatic: 0.7 of what mixes up two fringe orders."""
     residual_sigmas: float = setting(
@@ -55,28 +61,36 @@ class AbsolutePhase:
     """Where on the projector the light of every pixel comes from."""
 
     projector_px: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Projector column", unit="px", colormap="turbo")
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Projector column", unit="px", colormap="turbo"),
     ]
     """Projector column u, pixel centres at integers; NaN where invalid. Empty if columns weren't coded."""
     projector_row_px: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Projector row", unit="px", colormap="turbo")
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Projector row", unit="px", colormap="turbo"),
     ]
     """Projector row v; empty if rows weren't coded."""
     wrapped_rad: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Wrapped phase", unit="rad", colormap="twilight")
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Wrapped phase", unit="rad", colormap="twilight"),
     ]
     """Of the highest frequency, in (-pi, pi]."""
     modulation_gray: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Modulation", unit="gray", colormap="viridis")
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Modulation", unit="gray", colormap="viridis"),
     ]
     residual_cycles: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Contradiction", unit="cycles", colormap="inferno", low=0.0)
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Contradiction", unit="cycles", colormap="inferno", low=0.0),
     ]
     sigma_px: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Predicted noise", unit="px", colormap="inferno", low=0.0)
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Predicted noise", unit="px", colormap="inferno", low=0.0),
     ]
     sigma_row_px: Mapping[str, Float32[np.ndarray, "_h _w"]]
-    reasons: Annotated[Mapping[str, UInt16[np.ndarray, "_h _w"]], Mask("Missing because", REASON_LABELS, bits=True)]
+    reasons: Annotated[
+        Mapping[str, UInt16[np.ndarray, "_h _w"]], Mask("Missing because", REASON_LABELS, bits=True)
+    ]
     exposure_index: Mapping[str, UInt8[np.ndarray, "_h _w"]]
     """Exposure of the largest weight, 255 for none."""
     valid_share: Annotated[float, Value("Pixels with a phase")]
@@ -99,7 +113,9 @@ def fringe_phase(
 ) -> AbsolutePhase:
     """Find the projector position of each pixel from all frequencies together."""
     if facts.projector is None:
-        raise StageFailedError("The size of the projected pattern isn't known: add the projector to the capture.")
+        raise StageFailedError(
+            "The size of the projected pattern isn't known: add the projector to the capture."
+        )
     size_px = {"x": facts.projector.width_px, "y": facts.projector.height_px}
     decoded: dict[str, dict[str, numerics.AbsolutePhase]] = {"x": {}, "y": {}}
     orders: FringeOrders | None = None
@@ -116,7 +132,9 @@ def prepare_orders(axis: AxisPhasors, params: FringePhaseParams) -> FringeOrders
     way = params.unwrapping or _automatic(axis)
     if way == "gray_code":
         if axis.gray is None:
-            raise StageFailedError("Fringe orders by Gray code need Gray code frames: choose maximum likelihood.")
+            raise StageFailedError(
+                "Fringe orders by Gray code need Gray code frames: choose maximum likelihood."
+            )
         return fringe_orders.code_aided(axis.periods, codes=axis.gray.codes)
     if way == "cascade":
         return fringe_orders.cascade(axis.periods)
@@ -169,7 +187,9 @@ def _reject_contradictions(
     noise_gain = np.float32(np.sqrt(max(axis.code.noise_gains)) / (2 * np.pi))
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma_cycles = axis.sigma_gray * (noise_gain / decoded.modulation_gray)
-    limit = np.float32(params.residual_floor_cycles) + np.float32(params.residual_sigmas) * sigma_cycles
+    limit = (
+        np.float32(params.residual_floor_cycles) + np.float32(params.residual_sigmas) * sigma_cycles
+    )
     doubtful = (decoded.residual_cycles > limit) & (decoded.reasons == 0)
     decoded.reasons[doubtful] |= np.uint16(Reason.ORDER_RESIDUAL)
     decoded.projector_px[doubtful] = np.nan

@@ -18,9 +18,10 @@ from backend.domain.stage import stage
 from backend.domain.states import Review
 from backend.numerics import phasors as numerics
 from backend.numerics.phasors import NO_EXPOSURE
-from backend.numerics.reasons import SENTENCES, Reason
+from backend.numerics.reasons import Reason
 from backend.numerics.sine_code import SineCode
 from backend.numerics.uncertainty import NoiseModel
+from backend.stages.cloud import REASON_LABELS
 from backend.stages.fringe_capture import FringeFrames
 from backend.stages.fringe_sets import FringeSet, fringe_sets
 from backend.stages.gray_orders import GrayPosition, gray_position
@@ -28,9 +29,6 @@ from backend.stages.pre_exposure import Preview
 from backend.stages.zones import Zones, zone_of_pixels
 
 Strategy = Literal["weighted", "longest_unsaturated", "masks"]
-
-REASON_LABELS = {int(reason): sentence for reason, sentence in SENTENCES.items()}
-"""What each bit of a reasons map means, for the legend."""
 
 
 class FusionParams(Params):
@@ -85,13 +83,17 @@ class Phasors:
     ]
     """1 = shortest exposure ..., 0 = none serves the pixel."""
     fused: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Fused picture", unit="gray/ms", colormap="gray")
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Fused picture", unit="gray/ms", colormap="gray"),
     ]
     modulation_gray: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]], Picture("Modulation", unit="gray", colormap="viridis")
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Modulation", unit="gray", colormap="viridis"),
     ]
     """Amplitude of the first frequency, in gray levels of the pixel's dominating exposure."""
-    reasons: Annotated[Mapping[str, UInt16[np.ndarray, "_h _w"]], Mask("Missing because", REASON_LABELS, bits=True)]
+    reasons: Annotated[
+        Mapping[str, UInt16[np.ndarray, "_h _w"]], Mask("Missing because", REASON_LABELS, bits=True)
+    ]
     served_share: Annotated[float, Value("Pixels served")]
     saturated_share: Annotated[float, Value("Saturated at every exposure")]
 

@@ -62,7 +62,9 @@ class Preview:
     histogram: Annotated[
         Float[np.ndarray, "gray"], Histogram("Gray levels, lit pixels of all cameras")
     ]
-    white: Annotated[Mapping[str, Integer[np.ndarray, "_h _w"]], Picture("White field", unit="gray")]
+    white: Annotated[
+        Mapping[str, Integer[np.ndarray, "_h _w"]], Picture("White field", unit="gray")
+    ]
     foreground: Annotated[Mapping[str, Bool[np.ndarray, "_h _w"]], Mask("Lit pixels", {1: "lit"})]
     rate_gray_per_ms: Annotated[
         Mapping[str, Float[np.ndarray, "_h _w"]],
