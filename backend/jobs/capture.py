@@ -1,0 +1,323 @@
+"""Drive capture plans: frames from the journal where it has them, from the rig where it doesn't.
+
+Driving a plan again with journalled frames is resume after a crash, undo, partial re-capture and replay in one:
+plans are deterministic, so the same frames lead to the same shots.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from math import isfinite
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from backend.devices.errors import DeviceError
+from backend.devices.protocols import Frame as DeviceFrame
+from backend.domain.errors import InvalidCaptureError, RigFailedError, StageFailedError
+from backend.domain.frames import Frame, InMemory, Pixels
+from backend.domain.patterns import Pattern
+from backend.domain.rig import RigFacts
+from backend.domain.shots import Burst, Exposed, Plan, Shot, Until
+from backend.jobs.control import JobControl
+from backend.jobs.journal import Journal, shot_document, shot_hash
+from backend.jobs.rendering import render
+from backend.jobs.shooting import Shooter
+from backend.storage.artifacts import ArtifactStore, StoredPixels
+from backend.storage.rows import FrameRow
+
+T = TypeVar("T")
+
+
+class Seen(Protocol):
+    """Is told of every picture at once: for the live preview and the event stream."""
+
+    def __call__(self, camera: str, frame: DeviceFrame, row: FrameRow | None) -> None:
+        """Look at a picture; `row` is None if it isn't kept. Must not block."""
+        ...
+
+
+def _unseen(camera: str, frame: DeviceFrame, row: FrameRow | None) -> None:
+    """Look at nothing."""
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """One camera's share of a shot: which frame of the journal it is."""
+
+    shot: Shot
+    camera: str
+    mask_hash: str | None
+    id: str
+    occurrence: int
+
+
+@dataclass
+class CaptureSession:
+    """Everything that one run of a capturing stage needs to drive its plans.
+
+    `run_plan` may be called several times; a shot that is asked for again is a new occurrence, across plans.
+    """
+
+    scan: str
+    stage: str
+    take: int
+    facts: RigFacts
+    journal: Journal
+    store: ArtifactStore
+    shooter: Shooter | None
+    """None: nothing is captured, every frame has to be in the journal (a replay)."""
+    control: JobControl = field(default_factory=JobControl)
+    seen: Seen = _unseen
+    clock: Callable[[], float] = time.monotonic
+    _occurrences: Counter[str] = field(default_factory=Counter, init=False)
+    _masks: dict[int, tuple[Pixels, str]] = field(default_factory=dict, init=False)
+    _loaded: tuple[str, ...] = field(default=(), init=False)
+
+    def run_plan(self, plan: Plan[T]) -> T:
+        """Drive a plan to its end and return what it learnt.
+
+        Raises
+        ------
+        CancelledError
+            Between two shots, or while one is waited for.
+        RigFailedError
+            If a device gives up. The frames captured before are kept.
+        StageFailedError
+            If what `Until` waits for doesn't come, or a pattern can't be rendered.
+        """
+        try:
+            request = next(plan)
+            while True:
+                self.control.check()
+                request = plan.send(self._answer(request))
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]  # a generator's return value has no type here
+        finally:
+            plan.close()
+
+    def _answer(self, request: Burst | Until) -> tuple[Exposed, ...]:
+        if isinstance(request, Until):
+            return (self._until(request),)
+        return self._burst(request)
+
+    # bursts
+
+    def _burst(self, burst: Burst) -> tuple[Exposed, ...]:
+        asked = [self._ask(shot) for shot in burst]
+        known = [self._known(shares) for shares in asked]
+        missing = [i for i, frames in enumerate(known) if len(frames) < len(asked[i])]
+        pace = _Pace([burst[i].exposure_ms for i in missing], self.clock)
+        self._load([burst[i] for i in missing])
+        for n, i in enumerate(missing):
+            shares = [share for share in asked[i] if share.camera not in known[i]]
+            self._tell(pace, n, len(burst), burst[i], kept=len(burst) - len(missing))
+            known[i] |= {row.camera: row for row in self._shoot(shares)}
+        return tuple(
+            {share.camera: self._frame(share, rows[share.camera]) for share in shares}
+            for shares, rows in zip(asked, known, strict=True)
+        )
+
+    def _ask(self, shot: Shot) -> list[_Asked]:
+        mask_hash = self._mask_hash(shot.mask)
+        shares = []
+        for camera in shot.cameras or tuple(self.facts.cameras):
+            if camera not in self.facts.cameras:
+                known = ", ".join(self.facts.cameras)
+                raise StageFailedError(
+                    f"{self.stage} asks for camera {camera!r}, the rig has {known}."
+                )
+            identity = shot_hash(shot, camera, mask_hash)
+            shares.append(_Asked(shot, camera, mask_hash, identity, self._occurrences[identity]))
+            self._occurrences[identity] += 1
+        return shares
+
+    def _known(self, shares: Sequence[_Asked]) -> dict[str, FrameRow]:
+        found = {s.camera: self.journal.find(s.id, s.occurrence) for s in shares}
+        return {camera: row for camera, row in found.items() if row is not None}
+
+    def _shoot(self, shares: Sequence[_Asked]) -> list[FrameRow]:
+        return [self._keep(s, frame) for s, frame in self._expose(shares)]
+
+    def _expose(self, shares: Sequence[_Asked]) -> list[tuple[_Asked, DeviceFrame]]:
+        shot = shares[0].shot
+        assert self.shooter is not None  # `_load` refused otherwise
+        try:
+            frames = self.shooter.take(
+                self._loaded.index(_picture_id(shot.pattern, shares[0].mask_hash)),
+                exposure_ms=shot.exposure_ms,
+                gain_db=shot.gain_db,
+                cameras=[share.camera for share in shares],
+            )
+        except DeviceError as error:
+            raise self._failed(error) from error
+        return [(share, frames[share.camera]) for share in shares]
+
+    def _keep(self, share: _Asked, frame: DeviceFrame) -> FrameRow:
+        """Write the picture, then its line in the journal: a crash between the two loses one shot."""
+        artifact = self.store.put(np.ascontiguousarray(frame.data))
+        row = FrameRow(
+            scan=self.scan,
+            stage=self.stage,
+            take=self.take,
+            shot=share.id,
+            occurrence=share.occurrence,
+            camera=share.camera,
+            document=shot_document(share.shot, share.mask_hash),
+            artifact=artifact.hash,
+            bit_depth=frame.bits,
+            when=datetime.now(UTC),
+            metadata=_metadata(frame),
+        )
+        self.journal.add(row)
+        self.seen(share.camera, frame, row)
+        return row
+
+    def _frame(self, share: _Asked, row: FrameRow) -> Frame:
+        """Hand out a frame with the exposure and gain that the camera really used."""
+        return Frame(
+            camera=share.camera,
+            pattern=share.shot.pattern,
+            exposure_ms=row.metadata["exposure_us"] / 1000.0,
+            pixels=StoredPixels(self.store, row.artifact),
+            bit_depth=row.bit_depth,
+            gain_db=row.metadata["gain_db"],
+            role=share.shot.role,
+        )
+
+    # waiting for an operator or a condition
+
+    def _until(self, request: Until) -> Exposed:
+        shares = self._ask(request.shot)
+        rows = self._known(shares)
+        if len(rows) < len(shares):
+            rows = self._wait(request, shares)
+        return {share.camera: self._frame(share, rows[share.camera]) for share in shares}
+
+    def _wait(self, request: Until, shares: Sequence[_Asked]) -> dict[str, FrameRow]:
+        self._load([request.shot])
+        deadline = self.clock() + request.timeout_s
+        while True:
+            self.control.shots(None, f"waiting, {request.shot.role or 'picture'} by picture", None)
+            taken = self._expose(shares)
+            if request.ready({share.camera: _unsaved(share, frame) for share, frame in taken}):
+                return {share.camera: self._keep(share, frame) for share, frame in taken}
+            for share, frame in taken:
+                self.seen(share.camera, frame, None)
+            if self.clock() >= deadline:
+                raise StageFailedError(
+                    f"{self.stage} waited {request.timeout_s:g} s for a usable picture and none came: "
+                    f"look at the live picture and run again."
+                )
+
+    # what the projector gets
+
+    def _load(self, shots: Sequence[Shot]) -> None:
+        """Render what isn't loaded. Bursts that show the same patterns at other exposures load them once."""
+        if not shots:
+            return
+        if self.shooter is None:
+            raise InvalidCaptureError(
+                f"The captured frames lack {_named(shots[0])} of {self.stage}: capture again, "
+                f"or use the settings that they were captured with."
+            )
+        wanted = {_picture_id(s.pattern, self._mask_hash(s.mask)): s for s in shots}
+        if not set(wanted) <= set(self._loaded):
+            try:
+                self.shooter.load([self._picture(s, self.shooter) for s in wanted.values()])
+            except DeviceError as error:
+                raise self._failed(error) from error
+            self._loaded = tuple(wanted)
+
+    def _picture(self, shot: Shot, shooter: Shooter) -> np.ndarray[Any, np.dtype[np.uint8]]:
+        width_px, height_px = shooter.projector_size
+        return render(
+            shot.pattern,
+            width_px=width_px,
+            height_px=height_px,
+            gamma=self.facts.projector.gamma if self.facts.projector else 1.0,
+            mask=shot.mask.load() if shot.mask else None,
+        )
+
+    def _mask_hash(self, mask: Pixels | None) -> str | None:
+        """Identify a mask by its content; the store keeps it, so that the journal can be understood."""
+        if mask is None or isinstance(mask, StoredPixels):
+            return mask.hash if mask else None
+        if id(mask) not in self._masks:
+            # Keeping the mask keeps its id from being given to another one.
+            self._masks[id(mask)] = (mask, self.store.put(mask.load()).hash)
+        return self._masks[id(mask)][1]
+
+    # words
+
+    def _tell(self, pace: "_Pace", n: int, size: int, shot: Shot, *, kept: int) -> None:
+        share = (kept + n) / size if size > 1 else None
+        self.control.shots(share, f"{_named(shot)}, {kept + n + 1} of {size}", pace.remaining_s(n))
+
+    def _failed(self, error: DeviceError) -> RigFailedError:
+        kept = len(self.journal)
+        frames = "1 captured frame is" if kept == 1 else f"{kept} captured frames are"
+        cause = error.sentence.removesuffix(".")
+        return RigFailedError(
+            f"{cause}; {frames} kept, mend it and run again to go on.",
+            details={"device": error.device},
+        )
+
+
+def _unsaved(share: _Asked, frame: DeviceFrame) -> Frame:
+    return Frame(
+        camera=share.camera,
+        pattern=share.shot.pattern,
+        exposure_ms=frame.exposure_us / 1000.0,
+        pixels=InMemory(frame.data),
+        bit_depth=frame.bits,
+        gain_db=frame.gain_db,
+        role=share.shot.role,
+    )
+
+
+def _picture_id(pattern: Pattern, mask_hash: str | None) -> str:
+    return f"{pattern.model_dump_json()} {mask_hash}"
+
+
+def _named(shot: Shot) -> str:
+    return f"{shot.role or shot.pattern.kind} at {shot.exposure_ms:.4g} ms"
+
+
+def _metadata(frame: DeviceFrame) -> dict[str, Any]:
+    """Return what the camera told of a frame: numbers and texts, the rest of a driver's words stays out."""
+    told: Mapping[str, object] = {
+        **frame.metadata,
+        "frame_id": frame.frame_id,
+        "exposure_us": float(frame.exposure_us),
+        "gain_db": float(frame.gain_db),
+        "pixel_format": frame.pixel_format,
+        "timestamp_s": frame.timestamp_s,
+        "host_time_s": frame.host_time_s,
+    }
+    return {name: value for name, value in told.items() if _is_plain(value)}
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, float):
+        return isfinite(value)
+    return isinstance(value, str | int | bool)
+
+
+class _Pace:
+    """Estimates how long the rest of a burst takes: its light time, and what each shot took on top so far."""
+
+    def __init__(self, exposures_ms: Sequence[float], clock: Callable[[], float]) -> None:
+        self._light_s = np.concatenate([[0.0], np.cumsum(exposures_ms) / 1000.0])
+        self._clock = clock
+        self._began = clock()
+
+    def remaining_s(self, done: int) -> float | None:
+        """Return the seconds left after `done` shots; None before the first, and for a single shot."""
+        count = len(self._light_s) - 1
+        if done == 0 or count == 1:
+            return None
+        overhead_s = max(0.0, (self._clock() - self._began - self._light_s[done]) / done)
+        return float(self._light_s[-1] - self._light_s[done] + overhead_s * (count - done))
