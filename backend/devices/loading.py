@@ -1,0 +1,111 @@
+"""Rigs by name: built in, from an installed package, or as `package.module:factory`.
+
+A package from outside offers rigs through the entry-point group `unglare.rigs`; each entry is a callable
+that takes a mapping of options and returns a `Rig`. Nothing of a package is imported until its rig is opened,
+so one that is broken doesn't stop the others.
+"""
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from backend.devices.errors import RigConfigError, RigNotFoundError
+from backend.devices.protocols import Rig
+from backend.domain.errors import UnglareError
+
+GROUP = "unglare.rigs"
+
+_REQUIRED = ("name", "info", "cameras", "projector", "open", "close", "facts", "calibration")
+
+
+@dataclass(frozen=True)
+class RigEntry:
+    """A rig that can be opened by name."""
+
+    name: str
+    package: str
+    """Distribution that it comes from, with version."""
+
+
+def available_rigs() -> tuple[RigEntry, ...]:
+    """Return the rigs that have a name, the built-in one first; nothing is imported."""
+    built_in = RigEntry("simulated", "unglare")
+    return (built_in, *(RigEntry(e.name, _package(e)) for e in _entries().values()))
+
+
+def open_rig(name: str, options: Mapping[str, object] | None = None) -> Rig:
+    """Make a rig; its devices are opened by `Rig.open` or by entering it.
+
+    Parameters
+    ----------
+    name
+        `simulated`, a name from `available_rigs`, or `package.module:factory`.
+    options
+        What its factory takes; for `simulated` see `SimulatedRigConfig`.
+
+    Raises
+    ------
+    RigNotFoundError
+        If there is no such rig, module or factory.
+    RigConfigError
+        If the factory refuses the options or doesn't return a rig.
+    """
+    factory = _factory(name)
+    try:
+        rig = factory(dict(options or {}))
+    except UnglareError:
+        raise
+    except Exception as error:
+        # A third party's factory may raise anything; the cause keeps its traceback.
+        raise RigConfigError(
+            f"rig {name}: its factory failed with {type(error).__name__}: {error}; check its options"
+        ) from error
+    missing = [attribute for attribute in _REQUIRED if not hasattr(rig, attribute)]
+    if missing:
+        raise RigConfigError(
+            f"rig {name}: its factory returned a {type(rig).__name__} without {', '.join(missing)};"
+            " see backend.devices.protocols.Rig"
+        )
+    return rig
+
+
+def _factory(name: str) -> Callable[[Mapping[str, object]], Any]:
+    if name == "simulated":
+        from backend.devices.sim import create_rig  # numba and scipy: only when it is used
+
+        return create_rig
+    entry = _entries().get(name)
+    if entry is not None:
+        return _loaded(name, entry.load)
+    if ":" in name:
+        module, _, attribute = name.partition(":")
+        return _loaded(name, lambda: getattr(importlib.import_module(module), attribute))
+    names = ", ".join(rig.name for rig in available_rigs())
+    raise RigNotFoundError(
+        f"there is no rig {name!r}; choose {names}, or give package.module:factory"
+    )
+
+
+def _loaded(name: str, load: Callable[[], Any]) -> Callable[[Mapping[str, object]], Any]:
+    try:
+        factory = load()
+    except Exception as error:
+        # Importing a third party's module may fail in any way; the cause keeps its traceback.
+        raise RigNotFoundError(
+            f"rig {name} can't be loaded ({type(error).__name__}: {error}); check that its package is installed"
+        ) from error
+    if not callable(factory):
+        raise RigNotFoundError(
+            f"rig {name} is a {type(factory).__name__}, not a function that makes a rig; check its name"
+        )
+    return factory  # type: ignore[no-any-return]  # what it returns is checked by the caller
+
+
+def _entries() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def _package(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else ""

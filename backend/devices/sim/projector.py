@@ -1,0 +1,148 @@
+"""The simulated projector: patterns, light, and the trigger line to the cameras."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import UInt8
+
+from backend.devices.errors import FeatureError, GeometryError
+from backend.devices.protocols import DeviceInfo, Presented, ProjectorCapabilities
+from backend.devices.sim.clock import Clock
+from backend.devices.sim.config import SimulatedRigConfig
+from backend.devices.sim.link import Link
+from backend.devices.sim.renderer import Shown
+
+TriggerLine = Callable[[Shown, float, float], None]
+"""Called at each edge with what is shown, the time in [s] and how long it is shown in [us]."""
+
+_MAX_SEQUENCE = 512
+
+
+class SimulatedProjector(Link):
+    """A `SequenceProjector`. What it shows at the moment is `shown`; cameras read it when they are triggered."""
+
+    def __init__(self, config: SimulatedRigConfig, clock: Clock) -> None:
+        super().__init__(
+            "projector", DeviceInfo("unglare", "simulated DLP", serial="SIM-P", simulated=True)
+        )
+        self._config = config
+        self._clock = clock
+        self._period_s = (config.frame_period_ms or 0.0) / 1000.0
+        self._patterns: list[UInt8[np.ndarray, "h w"]] = []
+        self._shows = 0
+        self._failed = False
+        self._stop = threading.Event()
+        self._sequence: tuple[list[int], float, float] | None = None
+        self.trigger_lines: list[TriggerLine] = []
+        self.shown = Shown(self._uniform(0), 0)
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        """What it can do."""
+        self._need_link()
+        period = self._config.frame_period_ms
+        return ProjectorCapabilities(
+            size=self._config.projector_size,
+            refresh_hz=None if period is None else 1000.0 / period,
+            sequence=True,
+            max_sequence=_MAX_SEQUENCE,
+            linear=self._config.gamma == 1.0,
+            trigger_out=True,
+        )
+
+    def load(self, patterns: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
+        """Take patterns; they are copied."""
+        self._need_link()
+        width, height = self._config.projector_size
+        for index, pattern in enumerate(patterns):
+            if pattern.shape != (height, width):
+                size = "x".join(map(str, pattern.shape[::-1]))
+                raise GeometryError(
+                    self.name,
+                    f"pattern {index} is {size}, the display {width}x{height};"
+                    " render patterns in the display's size",
+                )
+        self._patterns = [self._frozen(pattern) for pattern in patterns]
+
+    def show(self, index: int, timeout_s: float = 2.0) -> Presented:
+        """Show a loaded pattern; lit when this returns."""
+        del timeout_s  # the display always follows
+        self._need_link()
+        if not 0 <= index < len(self._patterns):
+            raise FeatureError(
+                self.name, f"there is no pattern {index}, {len(self._patterns)} are loaded; load first"
+            )
+        return self._present(self._patterns[index], index)
+
+    def blank(self, level: int = 0) -> Presented:
+        """Show the whole field at one code."""
+        self._need_link()
+        if not 0 <= level <= 255:
+            raise FeatureError(self.name, f"level {level} is not within 0 to 255; choose another")
+        return self._present(self._uniform(level), -1)
+
+    def arm_sequence(self, indices: Sequence[int], exposure_us: float, period_us: float) -> None:
+        """Prepare a run."""
+        self._need_link()
+        missing = [index for index in indices if not 0 <= index < len(self._patterns)]
+        if missing:
+            raise FeatureError(self.name, f"there is no pattern {missing[0]}; load it first")
+        if len(indices) > _MAX_SEQUENCE:
+            raise FeatureError(
+                self.name,
+                f"{len(indices)} patterns exceed the {_MAX_SEQUENCE} of one sequence; split it",
+            )
+        if not 0 < exposure_us <= period_us:
+            raise FeatureError(
+                self.name,
+                f"an exposure of {exposure_us:g} us doesn't fit a period of {period_us:g} us; lengthen it",
+            )
+        self._sequence = (list(indices), exposure_us, period_us)
+        self._stop.clear()
+
+    def start_sequence(self) -> None:
+        """Run the sequence to its end, firing the trigger line once per pattern."""
+        self._need_link()
+        if self._sequence is None:
+            raise FeatureError(self.name, "no sequence is prepared; call arm_sequence first")
+        indices, exposure_us, period_us = self._sequence
+        self._sequence = None
+        start_s = self._clock.now_s()
+        for count, index in enumerate(indices):
+            if self._stop.is_set():
+                return
+            self._present(self._patterns[index], index, settle=False)
+            at_s = start_s + count * period_us * 1e-6
+            for fire in self.trigger_lines:
+                fire(self.shown, at_s, exposure_us)
+            self._clock.wait_until(at_s + period_us * 1e-6, self._stop)
+
+    def stop_sequence(self) -> None:
+        """Stop a running sequence."""
+        self._stop.set()
+
+    def _present(
+        self, pattern: UInt8[np.ndarray, "h w"], index: int, *, settle: bool = True
+    ) -> Presented:
+        limit = self._config.projector_fail_after_shows
+        if limit is not None and self._shows >= limit and not self._failed:
+            self._failed = True
+            raise self._lose(
+                f"no answer after {self._shows} patterns", for_good=self._config.fail_for_good
+            )
+        self._shows += 1
+        self.shown = Shown(pattern, self.shown.number + 1)
+        if settle:  # a pattern is whole from the next frame period on
+            self._clock.wait_until(self._clock.now_s() + self._period_s, self._stop)
+        return Presented(index, time.monotonic(), self._clock.now_s(), confirmed=True)
+
+    def _uniform(self, level: int) -> UInt8[np.ndarray, "h w"]:
+        width, height = self._config.projector_size
+        return self._frozen(np.full((height, width), level, np.uint8))
+
+    def _frozen(self, pattern: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+        copy = np.array(pattern, dtype=np.uint8, order="C")
+        copy.setflags(write=False)
+        return copy
