@@ -191,7 +191,8 @@ def _zone_index(
         preview.white[fringes.camera], zones.valleys_gray, preview.foreground[fringes.camera]
     )
     exposure_of_zone = np.array([NO_EXPOSURE, *reversed(range(count))], dtype=np.uint8)
-    return exposure_of_zone[label]
+    index: UInt8[np.ndarray, "h w"] = exposure_of_zone[label]
+    return index
 
 
 def _summarise(sets: tuple[AxisPhasors, ...], exposures_ms: tuple[float, ...]) -> Phasors:
