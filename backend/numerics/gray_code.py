@@ -1,0 +1,434 @@
+"""Decoding Gray code: which stripe each pixel sees, and how certain that is."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt16
+
+from backend.numerics.errors import CodeError, FrameError
+from backend.numerics.kernels import frame_part, frame_stack, kernel, row_loop
+from backend.numerics.reasons import Reason
+
+_TILE = 2048
+_BLOCK = 8 * _TILE
+_INVERSE, _WHITE_BLACK, _FIXED = 0, 1, 2
+_CODE_MARGIN = np.int32(Reason.CODE_MARGIN)
+_OUTSIDE = np.int32(Reason.OUTSIDE_PROJECTOR)
+_SATURATED = np.int32(Reason.SATURATED)
+_0, _1 = np.int32(0), np.int32(1)
+
+
+class GrayCode(NamedTuple):
+    """Which stripe of a Gray code each pixel sees."""
+
+    code: Int32[np.ndarray, "h w"]
+    """Number of the stripe, 0 at the pattern's beginning; -1 where `reasons` isn't 0."""
+    projector_px: Float32[np.ndarray, "h w"]
+    """Projector coordinate of the stripe's middle, pixel centres at integers; NaN where invalid."""
+    contrast_gray: UInt16[np.ndarray, "h w"]
+    """Contrast of the weakest bit that was read, |pattern - inverse| in [gray]."""
+    reasons: UInt16[np.ndarray, "h w"]
+    """Why a pixel is invalid: bits of `Reason`, 0 where it is valid."""
+
+
+def decode_gray_code(
+    patterns: Sequence[Shaped[np.ndarray, "h w"]],
+    inverses: Sequence[Shaped[np.ndarray, "h w"]],
+    *,
+    codes: int,
+    size_px: int,
+    min_contrast_gray: float = 5.0,
+    ignored_low_bits: int = 0,
+    saturation_gray: float = float("inf"),
+) -> GrayCode:
+    r"""Decode a Gray code of which each bit was shown with its inverse.
+
+    Parameters
+    ----------
+    patterns, inverses
+        The frames from the coarsest bit to the finest, uint8 or uint16, each its own array.
+    codes
+        Codes over the projector's width: often its columns, for which not every bit pattern occurs.
+    size_px
+        Projector's width (or height) in [px].
+    min_contrast_gray
+        A bit is 1 where pattern - inverse is more than this, 0 where it is less than minus this,
+        and unknown between; in [gray].
+    ignored_low_bits
+        Finest bits that aren't read because the optics don't resolve them: 2**n codes become one.
+    saturation_gray
+        A pixel is saturated where pattern and inverse of one bit both reach this gray level.
+
+    Raises
+    ------
+    FrameError
+        If the frames don't fit together.
+    CodeError
+        If the codes need more bits, or no bit is left to read.
+
+    Notes
+    -----
+    The bit is 1 if :math:`I - I' > \delta`, 0 if :math:`I - I' < -\delta` [1]_: free of any
+    assumption about reflectance and ambient light. Cost: every frame is read once.
+
+    References
+    ----------
+    .. [1] The "robust surface coding" method, equation 2, see the method's page.
+    """
+    bits = len(patterns)
+    if len(inverses) != bits:
+        raise FrameError(
+            f"{bits} patterns but {len(inverses)} inverses were given: give both of every bit"
+        )
+    read = _bits_to_read(bits, codes, ignored_low_bits)
+    frames = [*patterns[:read], *inverses[:read]]
+    return _decode(
+        frames, read, _INVERSE, bits - read, codes, size_px, min_contrast_gray, saturation_gray
+    )
+
+
+def decode_gray_code_by_reference(
+    patterns: Sequence[Shaped[np.ndarray, "h w"]],
+    *,
+    white: Shaped[np.ndarray, "h w"],
+    black: Shaped[np.ndarray, "h w"],
+    codes: int,
+    size_px: int,
+    min_contrast_gray: float = 5.0,
+    ignored_low_bits: int = 0,
+    saturation_gray: float = float("inf"),
+) -> GrayCode:
+    r"""Decode a Gray code against pictures of the white and the black field.
+
+    Parameters
+    ----------
+    patterns
+        The frames from the coarsest bit to the finest, uint8 or uint16.
+    white, black
+        Pictures of the white and the black field at the same exposure.
+    codes, size_px, ignored_low_bits
+        As in `decode_gray_code`.
+    min_contrast_gray
+        A bit is unknown where :math:`|2 I - (I_w + I_b)|` isn't more than this, in [gray]; it
+        compares with the contrast of pattern and inverse.
+    saturation_gray
+        A pixel is saturated where the white field reaches this gray level.
+
+    Raises
+    ------
+    FrameError
+        If the frames don't fit together.
+    CodeError
+        If the codes need more bits, or no bit is left to read.
+    """
+    read = _bits_to_read(len(patterns), codes, ignored_low_bits)
+    frames = [*patterns[:read], white, black]
+    left_out = len(patterns) - read
+    return _decode(
+        frames, read, _WHITE_BLACK, left_out, codes, size_px, min_contrast_gray, saturation_gray
+    )
+
+
+def decode_gray_code_by_threshold(
+    patterns: Sequence[Shaped[np.ndarray, "h w"]],
+    *,
+    threshold_gray: float,
+    codes: int,
+    size_px: int,
+    min_contrast_gray: float = 0.0,
+    ignored_low_bits: int = 0,
+) -> GrayCode:
+    """Decode a Gray code with one threshold for the whole picture: naive, kept for comparison.
+
+    A bit is 1 above `threshold_gray`, as in equation 1 of the "robust surface coding" method; it is
+    unknown where twice the distance from the threshold is less than `min_contrast_gray`, in [gray].
+    For everything else see `decode_gray_code`.
+    """
+    read = _bits_to_read(len(patterns), codes, ignored_low_bits)
+    return _decode(
+        list(patterns[:read]),
+        read,
+        _FIXED,
+        len(patterns) - read,
+        codes,
+        size_px,
+        min_contrast_gray,
+        float("inf"),
+        double_threshold_gray=int(np.floor(2 * threshold_gray)),
+    )
+
+
+def _bits_to_read(bits: int, codes: int, ignored_low_bits: int) -> int:
+    if codes < 1 or codes > 2**bits:
+        raise CodeError(
+            f"{codes} codes don't fit into {bits} bits: give 1 to {2**bits} codes or the missing frames"
+        )
+    if not 0 <= ignored_low_bits < bits:
+        raise CodeError(
+            f"ignoring {ignored_low_bits} of {bits} bits leaves none to read: ignore 0 to {bits - 1}"
+        )
+    return bits - ignored_low_bits
+
+
+def _decode(
+    frames: Sequence[Shaped[np.ndarray, "h w"]],
+    read: int,
+    mode: int,
+    left_out: int,
+    codes: int,
+    size_px: int,
+    min_contrast_gray: float,
+    saturation_gray: float,
+    double_threshold_gray: int = 0,
+) -> GrayCode:
+    stack = frame_stack(frames)
+    result = GrayCode(
+        code=np.empty(stack.shape, np.int32),
+        projector_px=np.empty(stack.shape, np.float32),
+        contrast_gray=np.empty(stack.shape, np.uint16),
+        reasons=np.empty(stack.shape, np.uint16),
+    )
+    _decode_gray(
+        stack.addresses,
+        stack.sample,
+        result.code.size,
+        read,
+        mode,
+        _Decision(
+            min_contrast=int(np.floor(min_contrast_gray)),
+            double_threshold=double_threshold_gray,
+            saturation=int(min(np.ceil(saturation_gray), 2**30)),
+            shift=left_out,
+            codes=codes,
+            pixels_per_code=size_px / codes,
+        ),
+        _Maps(*(plane.reshape(-1) for plane in result)),
+    )
+    return result
+
+
+class _Decision(NamedTuple):
+    min_contrast: int
+    double_threshold: int
+    saturation: int
+    shift: int
+    codes: int
+    pixels_per_code: float
+
+
+class _Maps(NamedTuple):
+    code: Any
+    projector_px: Any
+    contrast_gray: Any
+    reasons: Any
+
+
+@row_loop
+def _fill(row: Any, value: Any) -> None:
+    for i in range(row.size):
+        row[i] = value
+
+
+@row_loop
+def _read_bit(pattern: Any, inverse: Any, binary: Any, code: Any, contrast: Any) -> None:
+    """Append one bit: Gray to binary is a running exclusive or from the coarsest bit on."""
+    for i in range(code.size):
+        difference = np.int32(pattern[i]) - np.int32(inverse[i])
+        bit = binary[i] ^ (_1 if difference > _0 else _0)
+        binary[i] = bit
+        code[i] = (code[i] << _1) | bit
+        strength = abs(difference)
+        old = contrast[i]
+        contrast[i] = strength if strength < old else old
+
+
+@row_loop
+def _read_bit_against(pattern: Any, reference: Any, binary: Any, code: Any, contrast: Any) -> None:
+    """Append one bit that is 1 where twice the gray level is more than the reference."""
+    for i in range(code.size):
+        difference = (np.int32(pattern[i]) << _1) - reference[i]
+        bit = binary[i] ^ (_1 if difference > _0 else _0)
+        binary[i] = bit
+        code[i] = (code[i] << _1) | bit
+        strength = abs(difference)
+        old = contrast[i]
+        contrast[i] = strength if strength < old else old
+
+
+@row_loop
+def _keep_both_bright(pattern: Any, inverse: Any, brightest: Any) -> None:
+    for i in range(brightest.size):
+        lower = np.int32(min(pattern[i], inverse[i]))
+        old = brightest[i]
+        brightest[i] = lower if lower > old else old
+
+
+@row_loop
+def _add_to_reference(frame: Any, reference: Any) -> None:
+    for i in range(reference.size):
+        reference[i] += np.int32(frame[i])
+
+
+@row_loop
+def _store(
+    code: Any,
+    contrast: Any,
+    brightest: Any,
+    decision: Any,
+    code_out: Any,
+    projector_px: Any,
+    contrast_out: Any,
+    reasons_out: Any,
+) -> None:
+    min_contrast, saturation = np.int32(decision.min_contrast), np.int32(decision.saturation)
+    shift, codes = np.int32(decision.shift), np.int32(decision.codes)
+    pixels_per_code = np.float32(decision.pixels_per_code)
+    half = np.float32(0.5 * (1 << decision.shift))
+    for i in range(code.size):
+        first = code[i] << shift
+        reason = _CODE_MARGIN if contrast[i] <= min_contrast else _0
+        reason = reason | (_SATURATED if brightest[i] >= saturation else _0)
+        outside = _OUTSIDE if first >= codes else _0
+        reason = reason if reason != _0 else outside
+        code_out[i] = first if reason == _0 else np.int32(-1)
+        middle = (np.float32(first) + half) * pixels_per_code - np.float32(0.5)
+        projector_px[i] = middle if reason == _0 else np.float32(np.nan)
+        contrast_out[i] = np.uint16(contrast[i])
+        reasons_out[i] = np.uint16(reason)
+
+
+@row_loop
+def _decode_block(
+    addresses: Any,
+    sample: Any,
+    n_px: int,
+    block: int,
+    bits: int,
+    mode: int,
+    decision: Any,
+    maps: Any,
+) -> None:
+    rows = np.empty((5, _TILE), np.int32)
+    for start in range(block, min(block + _BLOCK, n_px), _TILE):
+        n = min(_TILE, n_px - start)
+        end = start + n
+        binary, code, contrast = rows[0, :n], rows[1, :n], rows[2, :n]
+        reference, brightest = rows[3, :n], rows[4, :n]
+        _fill(binary, _0)
+        _fill(code, _0)
+        _fill(contrast, np.int32(0xFFFF))
+        _fill(brightest, _0)
+        if mode == _INVERSE:
+            for bit in range(bits):
+                pattern = frame_part(addresses[bit], start, n, sample)
+                inverse = frame_part(addresses[bits + bit], start, n, sample)
+                _read_bit(pattern, inverse, binary, code, contrast)
+                if decision.saturation <= 0xFFFF:
+                    _keep_both_bright(pattern, inverse, brightest)
+        else:
+            _fill(reference, np.int32(decision.double_threshold))
+            if mode == _WHITE_BLACK:
+                white = frame_part(addresses[bits], start, n, sample)
+                _add_to_reference(white, reference)
+                _add_to_reference(frame_part(addresses[bits + 1], start, n, sample), reference)
+                _add_to_reference(white, brightest)
+            for bit in range(bits):
+                pattern = frame_part(addresses[bit], start, n, sample)
+                _read_bit_against(pattern, reference, binary, code, contrast)
+        _store(
+            code,
+            contrast,
+            brightest,
+            decision,
+            maps.code[start:end],
+            maps.projector_px[start:end],
+            maps.contrast_gray[start:end],
+            maps.reasons[start:end],
+        )
+
+
+@kernel
+def _decode_gray(
+    addresses: Any, sample: Any, n_px: int, bits: int, mode: int, decision: Any, maps: Any
+) -> None:
+    for block in numba.prange((n_px + _BLOCK - 1) // _BLOCK):
+        _decode_block(addresses, sample, n_px, block * _BLOCK, bits, mode, decision, maps)
+
+
+class DistinctPixels(NamedTuple):
+    """Projector pixels that were seen, each with the camera pixels that see it."""
+
+    projector_px: Int32[np.ndarray, "n 2"]
+    """Column and row of each projector pixel, sorted by row, then column."""
+    camera_px: Float64[np.ndarray, "n 2"]
+    """Mean position x, y of the camera pixels that see it, in [px]."""
+    count: Int64[np.ndarray, "n"]
+    """How many camera pixels see it, >= 1."""
+    spread_px: Float64[np.ndarray, "n"]
+    """Root mean square distance of these camera pixels from their mean, in [px]: a large one means
+    that separate places carry the same code, which no surface can do."""
+
+
+def distinct_projector_pixels(
+    columns: Int32[np.ndarray, "h w"],
+    rows: Int32[np.ndarray, "h w"],
+    *,
+    width_px: int,
+    height_px: int,
+) -> DistinctPixels:
+    """Average the camera pixels that see the same projector pixel.
+
+    Parameters
+    ----------
+    columns, rows
+        Projector column and row that each camera pixel sees; negative where unknown.
+    width_px, height_px
+        Size of the projector.
+
+    Raises
+    ------
+    CodeError
+        If a column or row isn't on the projector.
+
+    Notes
+    -----
+    Cost: a few passes over the valid pixels; memory: five numbers per projector pixel.
+
+    Examples
+    --------
+    >>> columns = np.array([[3, 3, -1]], dtype=np.int32)
+    >>> seen = distinct_projector_pixels(columns, np.zeros_like(columns), width_px=8, height_px=1)
+    >>> seen.camera_px, seen.count
+    (array([[0.5, 0. ]]), array([2]))
+    """
+    valid = (columns >= 0) & (rows >= 0)
+    if (columns[valid] >= width_px).any() or (rows[valid] >= height_px).any():
+        raise CodeError(
+            f"codes up to column {int(columns.max())}, row {int(rows.max())} aren't on a projector of "
+            f"{width_px} x {height_px} px: give the projector's size"
+        )
+    camera_y, camera_x = np.nonzero(valid)
+    index = rows[valid].astype(np.int64) * width_px + columns[valid]
+    count = np.bincount(index, minlength=width_px * height_px)
+    seen = np.flatnonzero(count)
+    count = count[seen]
+    x, y = (np.bincount(index, weights=place)[seen] / count for place in (camera_x, camera_y))
+    # From the mean, not as a difference of squares: positions are thousands, spreads a pixel.
+    position = np.searchsorted(seen, index)
+    squares = (camera_x - x[position]) ** 2 + (camera_y - y[position]) ** 2
+    spread_px = np.sqrt(np.bincount(position, weights=squares, minlength=len(seen)) / count)
+    return DistinctPixels(
+        projector_px=np.stack([seen % width_px, seen // width_px], axis=1).astype(np.int32),
+        camera_px=np.stack([x, y], axis=1),
+        count=count,
+        spread_px=spread_px,
+    )
+
+
+def warm_up_kernels() -> None:
+    """Compile this module's kernels for the types of frames there are, see `warm_up`."""
+    for dtype in (np.uint8, np.uint16):
+        frame = np.zeros((1, 1), dtype)
+        decode_gray_code([frame], [frame], codes=2, size_px=2)

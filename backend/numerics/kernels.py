@@ -1,0 +1,155 @@
+"""How kernels are compiled here, and how they read frames that lie apart in memory.
+
+Importing this module imports numba (0.3 s), so only modules with kernels import it.
+"""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar, no_type_check
+
+import numba
+import numpy as np
+from jaxtyping import Shaped, UInt
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from backend.numerics.errors import FrameError
+
+# The default layer may fall back to "workqueue", which aborts the process when two Python threads
+# run parallel kernels at the same time; a station's server and its capture thread do that.
+numba.config.THREADING_LAYER = "omp"
+
+# Everything of `fastmath` but nnan and ninf: with those LLVM deletes the tests for NaN, which
+# means "invalid" in every map here.
+FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def kernel(function: Function) -> Function:
+    """Compile a kernel lazily; its `prange` loops run on all threads, outside the GIL.
+
+    Shape checks wrap every function in the tests; numba needs the bare one, and so does its cache:
+    tests and product share one entry. The cache notices changes in a kernel's own file only, so
+    the row loops that a kernel calls stand in the file of the kernel.
+    """
+    compiled: Function = numba.njit(
+        parallel=True, cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH
+    )(inspect.unwrap(function))
+    return compiled
+
+
+def row_loop(function: Function) -> Function:
+    """Compile a loop over one-dimensional rows, for kernels to call.
+
+    One plain loop per function and few arrays per loop: that is what LLVM vectorises. The same
+    statements written straight into a parallel kernel run scalar, ten times slower. There is no
+    wrapper for calls from Python, and no cache entry beside the kernel's: half the time to compile.
+    """
+    compiled: Function = numba.njit(
+        error_model="numpy", fastmath=FAST_MATH, no_cpython_wrapper=True, no_cfunc_wrapper=True
+    )(inspect.unwrap(function))
+    return compiled
+
+
+@no_type_check
+@intrinsic
+def _pointer(typingctx, address):  # noqa: ANN001, ANN202
+    """Read an integer as the address of untyped memory."""
+
+    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+
+    return types.voidptr(types.uintp), codegen
+
+
+@no_type_check
+@numba.njit(cache=True, nogil=True, inline="always")
+def frame_part(address, start, length, sample):  # noqa: ANN001, ANN201
+    """View `length` pixels from pixel `start` on of the frame at `address`; `sample` has its type."""
+    return numba.carray(
+        _pointer(np.uintp(address + start * sample.itemsize)), (length,), sample.dtype
+    )
+
+
+class FrameStack(NamedTuple):
+    """Frames that lie apart in memory (memory-mapped files), as kernels take them."""
+
+    addresses: UInt[np.ndarray, "n_frames"]
+    """Address of each frame's first pixel."""
+    sample: UInt[np.ndarray, "1"]
+    """An array of the frames' type, writable even where frames are not: one compiled kernel each."""
+    shape: tuple[int, int]
+    """Height and width of the frames."""
+    frames: tuple[Shaped[np.ndarray, "h w"], ...]
+    """The frames themselves, held as long as their addresses are in use."""
+
+
+def frame_stack(frames: Sequence[Shaped[np.ndarray, "..."]]) -> FrameStack:
+    """Collect the addresses of frames without copying them.
+
+    Parameters
+    ----------
+    frames
+        Pictures of one size, all uint8 or all uint16. A frame that isn't contiguous is copied.
+
+    Returns
+    -------
+    FrameStack
+        Valid as long as it is referenced.
+
+    Raises
+    ------
+    FrameError
+        If there is no frame, or sizes or types differ, or the type is another one.
+
+    Notes
+    -----
+    Stacking twelve frames of five megapixels would cost more than decoding them. An array of
+    addresses serves any number of frames with one compiled kernel; a tuple of arrays would need
+    one per number.
+    """
+    if not frames:
+        raise FrameError("no frame was given: at least one is needed")
+    first = frames[0]
+    if first.ndim != 2 or first.dtype not in (np.uint8, np.uint16):
+        raise FrameError(
+            f"frame 0 is {first.dtype} of shape {first.shape}: give height x width of uint8 or uint16"
+        )
+    for index, frame in enumerate(frames):
+        if frame.shape != first.shape or frame.dtype != first.dtype:
+            raise FrameError(
+                f"frame {index} is {frame.dtype} of shape {frame.shape} but frame 0 is {first.dtype} "
+                f"of shape {first.shape}: give frames of one camera in one size and bit depth"
+            )
+    held = tuple(np.require(frame, requirements=["C", "A"]) for frame in frames)
+    addresses = np.array([frame.ctypes.data for frame in held], dtype=np.uintp)
+    sample = np.zeros(1, first.dtype)
+    return FrameStack(addresses=addresses, sample=sample, shape=first.shape, frames=held)
+
+
+class _Memory:
+    """Memory of an array, described as writable; holds the array."""
+
+    def __init__(self, array: Shaped[np.ndarray, "..."]) -> None:
+        self.array = array
+        self.__array_interface__ = {
+            "data": (array.ctypes.data, False),
+            "shape": array.shape,
+            "typestr": array.dtype.str,
+            "version": 3,
+        }
+
+
+def kernel_input(array: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
+    """View an array as kernels want their inputs: contiguous, aligned, and of the writable type.
+
+    To numba a read-only array (a memory-mapped file) is another type than a writable one, and
+    each type costs a compilation of seconds. Kernels never write to their inputs. An array that
+    isn't contiguous is copied.
+    """
+    plain = np.require(array, requirements=["C", "A"])
+    if plain.flags.writeable and type(plain) is np.ndarray:
+        return plain
+    # Memory of size 0 has no address worth describing.
+    return np.asarray(_Memory(plain)) if plain.size else np.empty(plain.shape, plain.dtype)

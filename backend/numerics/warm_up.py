@@ -1,0 +1,20 @@
+"""Compile every kernel, or load it from the cache, before the first scan needs it."""
+
+from importlib import import_module
+
+MODULES = (
+    "backend.numerics.absolute_phase",
+    "backend.numerics.phasors",
+    "backend.numerics.gray_code",
+)
+"""Modules with kernels: each has a function `warm_up_kernels()` that runs them on tiny arrays."""
+
+
+def warm_up() -> None:
+    """Run every kernel once on tiny arrays, for uint8 and uint16 frames.
+
+    Takes minutes where nothing is compiled yet, a second or two from the cache; call it in a thread
+    of its own: kernels release the GIL.
+    """
+    for name in MODULES:
+        import_module(name).warm_up_kernels()
