@@ -1,28 +1,27 @@
-"""From a mapped record to the frozen row that leaves the storage layer."""
+"""From a mapped record to the frozen row that leaves the storage layer, and back."""
 
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from backend.storage.tables import Base
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Row = TypeVar("Row", bound="DataclassInstance")
+Row = TypeVar("Row")
 
 
 def as_row(kind: type[Row], record: Base) -> Row:
-    """Copy the columns that the row has; a column's attribute may end in an underscore."""
-    return kind(**{f.name: _column(record, f.name) for f in fields(kind)})
+    """Copy the columns that the row (a frozen dataclass) has a field for."""
+    return kind(**{name: getattr(record, _attribute(name)) for name in _names(kind)})
 
 
-def _column(record: Base, name: str) -> Any:
+def as_values(row: object) -> dict[str, Any]:
+    """Return a row's fields under the names of the columns' attributes."""
+    return {_attribute(name): getattr(row, name) for name in _names(row)}
+
+
+def _names(row: Any) -> list[str]:
+    return [field.name for field in fields(row)]
+
+
+def _attribute(name: str) -> str:
     # `metadata` belongs to SQLAlchemy's base class: the column's attribute is `metadata_`.
-    return getattr(record, name + "_" if name == "metadata" else name)
-
-
-def as_values(row: "DataclassInstance") -> dict[str, Any]:
-    """Return the row's fields under the names of the columns' attributes."""
-    return {
-        f.name + "_" if f.name == "metadata" else f.name: getattr(row, f.name) for f in fields(row)
-    }
+    return "metadata_" if name == "metadata" else name
