@@ -24,17 +24,18 @@ def upgrade(connection: Connection, to: str = "head") -> None:
     """
     _keep_others_out(connection)
     _refuse_newer(connection)
-    command.upgrade(_config(connection), to)
+    command.upgrade(configuration(connection), to)
 
 
 def downgrade(connection: Connection, to: str) -> None:
     """Take migrations back, e.g. `base` for all; data of dropped tables is lost."""
     _keep_others_out(connection)
     _refuse_newer(connection)
-    command.downgrade(_config(connection), to)
+    command.downgrade(configuration(connection), to)
 
 
-def _config(connection: Connection) -> Config:
+def configuration(connection: Connection) -> Config:
+    """Return what Alembic has to know, without a file."""
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
     config.set_main_option("path_separator", "os")
@@ -49,7 +50,9 @@ def _keep_others_out(connection: Connection) -> None:
 
 
 def _refuse_newer(connection: Connection) -> None:
-    known = {s.revision for s in ScriptDirectory.from_config(_config(connection)).walk_revisions()}
+    known = {
+        s.revision for s in ScriptDirectory.from_config(configuration(connection)).walk_revisions()
+    }
     present = MigrationContext.configure(connection).get_current_heads()
     if newer := sorted(set(present) - known):
         raise StartupError(
