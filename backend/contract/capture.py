@@ -4,6 +4,7 @@
 `exposure_ms`, `stage` and `mask` may be absent or null.
 """
 
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -65,6 +66,22 @@ def _no_nones(value: Any) -> Any:
     return value or None
 
 
+class JournalPlace(_Part):
+    """Which shot of which capture a frame is: written by our own exports, so that they can be driven again."""
+
+    take: int = Field(ge=0)
+    occurrence: int = Field(ge=0)
+    """0 for the first time that the plan asked for this shot, 1 for the second ..."""
+    exposure_ms: float = Field(gt=0)
+    """As the plan asked for it; the frame's own exposure is what the camera made of it."""
+    gain_db: float = 0.0
+    mask: str | None = None
+    """File (.npy) of the intensity mask, bit by bit."""
+    captured: datetime
+    metadata: dict[str, float | int | str | bool] = {}
+    """What the camera told of the frame."""
+
+
 class CapturedFrame(_Part):
     """One picture file and what it shows."""
 
@@ -79,6 +96,7 @@ class CapturedFrame(_Part):
     role: str = ""
     mask: str | None = None
     """File of the intensity mask that the pattern was multiplied with."""
+    journal: JournalPlace | None = None
 
 
 class Capture(_Part):

@@ -31,7 +31,8 @@ class Method:
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Named sets of settings: `{"fast": {"exposures.budget": "fast"}}`."""
     importers: Mapping[str, Callable[[tuple[Frame, ...]], Any]] = field(default_factory=dict)
-    """How imported frames become the result of a capturing stage: `{stage: function of frames}`.
+    """How imported frames become the result of a capturing stage: `{stage: function of frames}`, or, where
+    the method doesn't capture them itself, a given result: `{name of its type: function of frames}`.
     Frames that name no stage belong to the first one."""
 
     def __post_init__(self) -> None:
@@ -39,9 +40,10 @@ class Method:
         names = [s.name for s in self.stages]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise TypeError(f"method {self.name!r} lists {twice} twice: use stage.named(...)")
-        if unknown := sorted(set(self.importers) - set(names)):
+        known = {*names, *(t.__name__ for t in self.given)}
+        if unknown := sorted(set(self.importers) - known):
             raise TypeError(
-                f"method {self.name!r} imports frames for {unknown}, which it doesn't list"
+                f"method {self.name!r} imports frames for {unknown}, which is neither a stage of it nor given"
             )
         for s in self.stages:
             self._wire(s)
@@ -65,6 +67,13 @@ class Method:
             if t.__name__ == name:
                 return t
         raise KeyError(name)
+
+    def type_of(self, name: str) -> type:
+        """Return the type of the result that is handed over under a name: a stage's, or the given type itself."""
+        for s in self.stages:
+            if s.name == name:
+                return s.output
+        return self.type_named(name)
 
     def describe(self) -> dict[str, Any]:
         """Return the method's description as JSON values."""

@@ -23,7 +23,7 @@ from backend.domain.states import JobStatus, Level, Verdict
 from backend.jobs.capture import CaptureSession
 from backend.jobs.control import JobControl, Live
 from backend.jobs.journal import DatabaseJournal
-from backend.jobs.loading import LoadedScan, load_inputs, load_scan
+from backend.jobs.loading import NO_RIG, LoadedScan, load_inputs, load_scan
 from backend.jobs.plan import Gate, PlannedStage, next_step
 from backend.jobs.rigs import LivePicture, Owner, RigGiven, RigPool
 from backend.jobs.shooting import Shooter
@@ -218,36 +218,50 @@ class JobExecution:
     def _capture(self, planned: PlannedStage, scan: LoadedScan, task: StageTask) -> Outcome:
         """Capture with the rig's lock held; write the result when the rig is free again."""
         stage, params = planned.stage, planned.settings.params
-        owner = Owner(scan.row.id, scan.title, self._job.who)
-        with self._shop.rigs.lease(scan.row.rig, scan.row.rig_options, owner) as lease:
-            result, device = lease.call(lambda rig: self._shoot(rig, planned, scan, task))
+        device: dict[str, Any] = {}
+        if scan.row.rig == NO_RIG:
+            result = self._drive(None, planned, scan, task)
+        else:
+            owner = Owner(scan.row.id, scan.title, self._job.who)
+            with self._shop.rigs.lease(scan.row.rig, scan.row.rig_options, owner) as lease:
+                result, device = lease.call(lambda rig: self._shoot(rig, planned, scan, task))
         with stage_errors(stage):
             return replace(conclude(stage, result, params, self._shop.store), device=device)
 
     def _shoot(
         self, rig: Rig, planned: PlannedStage, scan: LoadedScan, task: StageTask
     ) -> tuple[Any, dict[str, Any]]:
+        with Shooter(rig, self.control) as shooter:
+            return self._drive(shooter, planned, scan, task), _devices(rig)
+
+    def _drive(
+        self,
+        shooter: Shooter | None,
+        planned: PlannedStage,
+        scan: LoadedScan,
+        task: StageTask,
+    ) -> Any:
+        """Run a capturing stage; without a shooter every frame has to be in the journal."""
         stage, shop = planned.stage, self._shop
         facts = decode(scan.given[RigFacts.__name__].document, RigFacts, shop.store)
-        with stage_errors(stage), Shooter(rig, self.control) as shooter:
-            session = CaptureSession(
-                scan=scan.row.id,
-                stage=planned.name,
-                take=planned.take,
-                facts=facts,
-                journal=DatabaseJournal(shop.database, scan.row.id, planned.name, planned.take),
-                store=shop.store,
-                shooter=shooter,
-                control=self.control,
-                seen=lambda camera, frame, row: self._seen(scan, camera, frame, row),
-            )
-            result = stage.run(
+        session = CaptureSession(
+            scan=scan.row.id,
+            stage=planned.name,
+            take=planned.take,
+            facts=facts,
+            journal=DatabaseJournal(shop.database, scan.row.id, planned.name, planned.take),
+            store=shop.store,
+            shooter=shooter,
+            control=self.control,
+            seen=lambda camera, frame, row: self._seen(scan, camera, frame, row),
+        )
+        with stage_errors(stage):
+            return stage.run(
                 decode_inputs(stage, task.inputs, shop.store),
                 planned.settings.params,
                 shoot=session.run_plan,
                 progress=self.control.progress,
             )
-        return result, _devices(rig)
 
     def _seen(
         self, scan: LoadedScan, camera: str, frame: DeviceFrame, row: FrameRow | None

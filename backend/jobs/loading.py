@@ -42,19 +42,22 @@ def load_scan(repositories: Repositories, registry: Registry, scan: str) -> Load
         If there is no such scan, or its method isn't there any more.
     """
     row = repositories.scans.get(scan)
+    journal = repositories.frames.takes(scan) if row.rig == NO_RIG else ()
     method = registry.get(row.method)
     edits = repositories.edits.of(scan)
     given = repositories.given.of(scan)
     runs = repositories.runs.of(scan, documents=False)
+    takes = present_takes(method, edits)
     finished = {run.key: run for run in runs if run.status is RunStatus.FINISHED}
     plan = plan_scan(
         scan,
         method,
         settings=resolve_settings(method, preset=row.preset, recipe=row.recipe, edits=edits),
-        takes=present_takes(method, edits),
+        takes=takes,
         given=given,
         history=History(finished.get, repositories.decisions.last_by_key(scan).get),
         has_rig=row.rig != NO_RIG,
+        journalled={stage for stage, take in journal if takes.get(stage) == take},
     )
     return LoadedScan(row, method, edits, given, runs, plan)
 

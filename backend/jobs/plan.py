@@ -5,7 +5,7 @@ is known only when every input's result is; so a plan ends at the first stage th
 after each one. A recomputation with equal numbers gives equal hashes, hence old keys, hence old results.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 from backend.domain.errors import StageUnavailableError
@@ -120,6 +120,7 @@ def plan_scan(
     given: Mapping[str, GivenRow],
     history: History,
     has_rig: bool = True,
+    journalled: Collection[str] = (),
 ) -> ScanPlan:
     """Find out where every stage stands.
 
@@ -136,12 +137,17 @@ def plan_scan(
     history
         Finished runs and decisions by key, of this scan only.
     has_rig
-        False: the frames were imported, capturing stages are unavailable unless given.
+        False: the frames were imported, capturing stages are unavailable unless given or journalled.
+    journalled
+        Capturing stages whose present take has frames in the journal: they can run without a rig.
     """
     planned: dict[str, PlannedStage] = {}
     for s in method.stages:
         base = PlannedStage(s, settings[s.name], takes.get(s.name, 0))
-        planned[s.name] = _plan_stage(base, method, scan, planned, given, history, has_rig)
+        can_capture = has_rig or s.name in journalled
+        planned[s.name] = _plan_stage(
+            base, method, scan, planned, given, history, has_rig, can_capture
+        )
     return ScanPlan(scan, tuple(planned.values()))
 
 
@@ -158,13 +164,14 @@ def _plan_stage(
     given: Mapping[str, GivenRow],
     history: History,
     has_rig: bool,
+    can_capture: bool,
 ) -> PlannedStage:
     s = base.stage
     if s.name in given:
         return replace(base, given=given[s.name])
     if base.settings.problem:
         return replace(base, missing=f"needs settings that hold. {base.settings.problem}")
-    if s.captures and not has_rig:
+    if s.captures and not can_capture:
         return replace(
             base, missing="needs a rig, and this scan has none: its frames were imported"
         )

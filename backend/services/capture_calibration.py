@@ -6,6 +6,14 @@ from jaxtyping import Float
 from backend.contract.capture import Capture, CapturedCamera, CapturedProjector, Extrinsics
 from backend.domain.errors import InvalidCalibrationError
 from backend.domain.rig import PinholeModel, Pose, RigCalibration
+from backend.numerics.camera_model import (
+    Pinhole,
+    RigidTransform,
+    check_pinhole,
+    compose,
+    inverse,
+)
+from backend.numerics.errors import CalibrationError
 
 PROJECTOR = "projector"
 
@@ -48,22 +56,26 @@ def _model(name: str, device: CapturedCamera | CapturedProjector) -> PinholeMode
             "positive focal lengths; calibrate again."
         )
     distortion = np.array(device.distortion or (0.0,) * 5, dtype=np.float64)
+    try:
+        check_pinhole(Pinhole(K, distortion, device.width_px, device.height_px), repr(name))
+    except CalibrationError as error:
+        raise InvalidCalibrationError(f"{str(error).rstrip('.')}.") from None
     return PinholeModel(device.width_px, device.height_px, K, distortion)
 
 
 def _poses(capture: Capture) -> dict[str, Pose]:
     """Walk the extrinsics from the reference camera: device -> x_device = R x_reference + t."""
-    poses = {capture.reference_camera: Pose(np.eye(3), np.zeros(3))}
-    links = [(link.from_, link.to, _pose(link)) for link in capture.extrinsics]
-    links += [(to, from_, inverse(pose)) for from_, to, pose in links]
+    poses = {capture.reference_camera: RigidTransform(np.eye(3), np.zeros(3))}
+    links = [(link.from_, link.to, _transform(link)) for link in capture.extrinsics]
+    links += [(to, from_, inverse(transform)) for from_, to, transform in links]
     for _ in links:
-        for from_, to, pose in links:
+        for from_, to, transform in links:
             if from_ in poses and to not in poses:
-                poses[to] = compose(pose, poses[from_])
-    return poses
+                poses[to] = compose(transform, poses[from_])
+    return {name: Pose(t.R, t.t_mm) for name, t in poses.items()}
 
 
-def _pose(link: Extrinsics) -> Pose:
+def _transform(link: Extrinsics) -> RigidTransform:
     R = np.array(link.R, dtype=np.float64)
     t_mm = np.array(link.t_mm, dtype=np.float64)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
@@ -74,19 +86,9 @@ def _pose(link: Extrinsics) -> Pose:
         raise InvalidCalibrationError(
             f"{link.from_!r} and {link.to!r} stand at the same place (t_mm is 0): without a base line there is no depth."
         )
-    return Pose(_nearest_rotation(R), t_mm)
+    return RigidTransform(_nearest_rotation(R), t_mm)
 
 
 def _nearest_rotation(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     u, _, vt = np.linalg.svd(R)
     return np.asarray(u @ vt)
-
-
-def inverse(pose: Pose) -> Pose:
-    """Turn x_b = R x_a + t around."""
-    return Pose(pose.R.T, -pose.R.T @ pose.t_mm)
-
-
-def compose(outer: Pose, inner: Pose) -> Pose:
-    """Return the pose that applies `inner` first, then `outer`."""
-    return Pose(outer.R @ inner.R, outer.R @ inner.t_mm + outer.t_mm)

@@ -171,7 +171,7 @@ def _fields(record: Any) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=512)
-def _adapter(annotation: Any) -> TypeAdapter[Any]:
+def _adapter(annotation: Any) -> Any:  # a TypeAdapter, which beartype has no words for
     return TypeAdapter(annotation)
 
 

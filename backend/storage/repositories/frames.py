@@ -33,6 +33,15 @@ class Frames:
         )
         return [as_row(FrameRow, record) for record in self._session.scalars(query)]
 
+    def takes(self, scan: str) -> set[tuple[str, int]]:
+        """Return the stages and takes of which there are frames."""
+        query = (
+            select(tables.Frame.stage, tables.Frame.take)
+            .where(tables.Frame.scan == scan)
+            .distinct()
+        )
+        return {(stage, take) for stage, take in self._session.execute(query)}
+
     def of_scan(self, scan: str) -> list[FrameRow]:
         """Return the frames of all takes of all stages, oldest first."""
         query = (
