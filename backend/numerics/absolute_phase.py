@@ -11,8 +11,10 @@ from backend.numerics import decoding_kernels as kernels
 from backend.numerics.errors import FrameError, FrequencyError
 from backend.numerics.fringe_orders import FringeOrders, hierarchical
 from backend.numerics.kernels import frame_stack, kernel_input
+from backend.numerics.order_rows import CODE
 from backend.numerics.phasors import Phasors, steps_of
 from backend.numerics.sine_code import SineCode
+from backend.numerics.sinusoid_rows import Steps
 from backend.numerics.uncertainty import NoiseModel
 
 
@@ -218,7 +220,7 @@ def absolute_phase(
     return maps
 
 
-def _with_average(steps: kernels.Steps) -> kernels.Steps:
+def _with_average(steps: Steps) -> Steps:
     """Scale the means' weights so that all frequencies' means add up to their average."""
     n_frequencies = steps.first_frame.size - 1
     scale = np.array([[1.0], [1.0], [1 / n_frequencies]], dtype=np.float32)
@@ -264,15 +266,16 @@ def _settings(
 
 def _shares(frequencies: Float64[np.ndarray, "k"], *, fuse: bool) -> Float64[np.ndarray, "k"]:
     """Weight of each frequency's position in the result."""
-    if fuse:
-        return frequencies**2 / (frequencies @ frequencies)
-    return (np.arange(frequencies.size) == np.argmax(frequencies)).astype(np.float64)
+    highest = np.arange(frequencies.size) == np.argmax(frequencies)
+    shares: Float64[np.ndarray, k] = frequencies**2 if fuse else highest.astype(np.float64)
+    shares /= shares.sum()
+    return shares
 
 
 def _coarse(
     orders: FringeOrders, coarse_px: Float32[np.ndarray, "h w"] | None, shape: tuple[int, ...]
 ) -> Float32[np.ndarray, "n_px"]:
-    if orders.tables.mode != kernels.CODE:
+    if orders.tables.mode != CODE:
         return np.zeros(0, np.float32)
     if coarse_px is None or coarse_px.shape != shape:
         given = None if coarse_px is None else coarse_px.shape

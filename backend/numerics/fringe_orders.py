@@ -11,8 +11,8 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from backend.numerics.decoding_kernels import CHAIN, CODE, LATTICE, Orders
 from backend.numerics.errors import FrequencyError
+from backend.numerics.order_rows import CHAIN, CODE, LATTICE, Orders
 
 MIN_DISTANCE_CYCLES = 0.02
 """Fringe orders nearer to each other than this are mixed up by 13 mrad of phase noise."""
@@ -118,7 +118,8 @@ def _maximum_likelihood(periods: tuple[float, ...], guard_band: float) -> Fringe
         )
     low, shape, cell_size = _cells(basis)
     centres = np.stack([axis.ravel() for axis in np.indices(tuple(shape))], axis=1)
-    _, nearest = cKDTree(points).query(low + (centres + 0.5) * cell_size, k=2)
+    found = cKDTree(points).query(low + (centres + 0.5) * cell_size, k=2)
+    nearest = np.asarray(found[1])
     offsets = (lines @ frequencies) / (frequencies @ frequencies)
     tables = Orders(
         mode=LATTICE,
@@ -179,8 +180,8 @@ def _order_lines(
         cycles = frequencies * middle
         low = np.floor(cycles - margin).astype(int)
         high = np.floor(cycles + margin).astype(int)
-        for orders in product(*(range(a, b + 1) for a, b in zip(low, high, strict=True))):
-            found.setdefault(orders, []).append(float(middle))
+        for chosen in product(*(range(a, b + 1) for a, b in zip(low, high, strict=True))):
+            found.setdefault(chosen, []).append(float(middle))
     lines = np.array(list(found), dtype=np.int64)
     places = np.array([(min(seen) + max(seen)) / 2 for seen in found.values()])
     return lines, places
@@ -210,7 +211,7 @@ def _smallest_distance(points: Float64[np.ndarray, "n d"]) -> float:
 
     if len(points) < 2:
         return float("inf")
-    distances, _ = cKDTree(points).query(points, k=2)
+    distances = np.asarray(cKDTree(points).query(points, k=2)[0])
     return float(distances[:, 1].min())
 
 

@@ -364,7 +364,7 @@ class DistinctPixels(NamedTuple):
     """Column and row of each projector pixel, sorted by row, then column."""
     camera_px: Float64[np.ndarray, "n 2"]
     """Mean position x, y of the camera pixels that see it, in [px]."""
-    count: Int64[np.ndarray, "n"]
+    n_camera_px: Int64[np.ndarray, "n"]
     """How many camera pixels see it, >= 1."""
     spread_px: Float64[np.ndarray, "n"]
     """Root mean square distance of these camera pixels from their mean, in [px]: a large one means
@@ -400,7 +400,7 @@ def distinct_projector_pixels(
     --------
     >>> columns = np.array([[3, 3, -1]], dtype=np.int32)
     >>> seen = distinct_projector_pixels(columns, np.zeros_like(columns), width_px=8, height_px=1)
-    >>> seen.camera_px, seen.count
+    >>> seen.camera_px, seen.n_camera_px
     (array([[0.5, 0. ]]), array([2]))
     """
     valid = (columns >= 0) & (rows >= 0)
@@ -422,7 +422,7 @@ def distinct_projector_pixels(
     return DistinctPixels(
         projector_px=np.stack([seen % width_px, seen // width_px], axis=1).astype(np.int32),
         camera_px=np.stack([x, y], axis=1),
-        count=count,
+        n_camera_px=count,
         spread_px=spread_px,
     )
 

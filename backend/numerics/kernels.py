@@ -3,25 +3,34 @@
 Importing this module imports numba (0.3 s), so only modules with kernels import it.
 """
 
+import hashlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, no_type_check
 
 import numba
 import numpy as np
 from jaxtyping import Shaped, UInt
 from numba.core import cgutils, types
+from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 
 from backend.numerics.errors import FrameError
 
 # The default layer may fall back to "workqueue", which aborts the process when two Python threads
 # run parallel kernels at the same time; a station's server and its capture thread do that.
-numba.config.THREADING_LAYER = "omp"
+_CONFIG: Any = numba.config
+_CONFIG.THREADING_LAYER = "omp"
 
 # Everything of `fastmath` but nnan and ninf: with those LLVM deletes the tests for NaN, which
 # means "invalid" in every map here.
 FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
+
+# What numba tells type checkers of itself changes from version to version and lacks options.
+_NJIT: Any = numba.njit
+_CACHE: Any = FunctionCache
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -30,13 +39,42 @@ def kernel(function: Function) -> Function:
     """Compile a kernel lazily; its `prange` loops run on all threads, outside the GIL.
 
     Shape checks wrap every function in the tests; numba needs the bare one, and so does its cache:
-    tests and product share one entry. The cache notices changes in a kernel's own file only, so
-    the row loops that a kernel calls stand in the file of the kernel.
+    tests and product share one entry.
     """
-    compiled: Function = numba.njit(
-        parallel=True, cache=True, nogil=True, error_model="numpy", fastmath=FAST_MATH
-    )(inspect.unwrap(function))
-    return compiled
+    bare = inspect.unwrap(function)
+    compiled: Any = _NJIT(parallel=True, nogil=True, error_model="numpy", fastmath=FAST_MATH)(bare)
+    # Where `cache=True` puts numba's own cache.
+    compiled._cache = _SourceCache(bare)  # noqa: SLF001 numba has no public way
+    dispatcher: Function = compiled
+    return dispatcher
+
+
+class _SourceCache(_CACHE):  # type: ignore[misc]  # its base is Any, see above
+    """Numba's cache on disk, which also notices changes in the row loops of other files.
+
+    Numba compares a kernel's own file only, so an edited row loop in another one would go on
+    running in its old form.
+    """
+
+    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
+        """Add the text of all files that the compiled code comes from."""
+        files = sorted(set(_source_files(self._py_func, set())))
+        return (*super()._index_key(signature, codegen), *map(_digest, files))
+
+
+def _source_files(function: Any, seen: set[Any]) -> Iterator[str]:
+    """List the files of a function and of all compiled functions that it calls."""
+    yield function.__code__.co_filename
+    for name in function.__code__.co_names:
+        called = getattr(function.__globals__.get(name), "py_func", None)
+        if called is not None and called not in seen:
+            seen.add(called)
+            yield from _source_files(called, seen)
+
+
+@lru_cache
+def _digest(file: str) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
 
 
 def row_loop(function: Function) -> Function:
@@ -46,7 +84,7 @@ def row_loop(function: Function) -> Function:
     statements written straight into a parallel kernel run scalar, ten times slower. There is no
     wrapper for calls from Python, and no cache entry beside the kernel's: half the time to compile.
     """
-    compiled: Function = numba.njit(
+    compiled: Function = _NJIT(
         error_model="numpy", fastmath=FAST_MATH, no_cpython_wrapper=True, no_cfunc_wrapper=True
     )(inspect.unwrap(function))
     return compiled
@@ -64,7 +102,7 @@ def _pointer(typingctx, address):  # noqa: ANN001, ANN202
 
 
 @no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(inline="always")
 def frame_part(address, start, length, sample):  # noqa: ANN001, ANN201
     """View `length` pixels from pixel `start` on of the frame at `address`; `sample` has its type."""
     return numba.carray(

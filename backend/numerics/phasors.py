@@ -6,11 +6,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float32, Shaped, UInt8, UInt16
 
-from backend.numerics import decoding_kernels as kernels
-from backend.numerics.decoding_kernels import NO_EXPOSURE
+from backend.numerics import fusion_kernels as kernels
 from backend.numerics.errors import FrameError
+from backend.numerics.fusion_kernels import NO_EXPOSURE
 from backend.numerics.kernels import FrameStack, frame_stack, kernel_input
 from backend.numerics.sine_code import SineCode, step_fit
+from backend.numerics.sinusoid_rows import Steps
 from backend.numerics.uncertainty import NoiseModel
 
 __all__ = [
@@ -54,12 +55,12 @@ class Phasors(NamedTuple):
     """Why a pixel has no phasor, or no trustworthy one: bits of `Reason`."""
 
 
-def steps_of(code: SineCode) -> kernels.Steps:
+def steps_of(code: SineCode) -> Steps:
     """Put a code's weights where the kernels read them."""
     fits = [step_fit(shifts_rad) for shifts_rad in code.shifts_rad]
     counts = [len(shifts_rad) for shifts_rad in code.shifts_rad]
     weights = np.concatenate([fit.weights for fit in fits], axis=1)
-    return kernels.Steps(
+    return Steps(
         first_frame=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         weights=np.ascontiguousarray(weights.astype(np.float32)),
     )

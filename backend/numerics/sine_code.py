@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -46,7 +46,9 @@ class SineCode:
             step_fit(shifts_rad, name=f"{periods:g} periods")
 
     @classmethod
-    def equal_steps(cls, periods: Sequence[float], n_steps: int, *, direction: int = 1) -> Self:
+    def equal_steps(
+        cls, periods: Sequence[float], n_steps: int, *, direction: int = 1
+    ) -> "SineCode":
         """Make a code of steps evenly spread over one period.
 
         Parameters

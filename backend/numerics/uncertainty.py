@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import erfc, pi, sqrt
-from typing import Self
 
 import numpy as np
 from jaxtyping import Float
@@ -52,7 +51,7 @@ class NoiseModel:
         full_scale_gray: float,
         black_gray: float = 0.0,
         gain_db: float = 0.0,
-    ) -> Self:
+    ) -> "NoiseModel":
         """Translate a camera's data sheet; gain multiplies both the read and the photon noise.
 
         Examples
@@ -71,7 +70,7 @@ class NoiseModel:
         return self.read_gray**2 + QUANTISATION_GRAY2
 
     def sigma_gray(self, gray: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-        """Standard deviation of a gray level in [gray]."""
+        """Predict the standard deviation of gray levels, in [gray]."""
         light = np.maximum(gray - self.black_gray, 0.0)
         sigma: Float[np.ndarray, "*shape"] = np.sqrt(
             self.dark_variance_gray2 + self.gray_per_e * light

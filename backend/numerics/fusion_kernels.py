@@ -1,0 +1,327 @@
+"""Compiled kernels from the frames of several exposures to phasors; see `phasors`."""
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from backend.numerics.kernels import frame_part, kernel, row_loop
+from backend.numerics.reasons import Reason
+from backend.numerics.sinusoid_rows import (
+    BLOCK,
+    NAN,
+    TILE,
+    ZERO,
+    average,
+    count_saturated,
+    demodulate,
+    fill,
+    new_rows,
+    predict_variance,
+)
+
+_SATURATED = np.int32(Reason.SATURATED)
+_DARK = np.int32(Reason.DARK)
+VALID = np.int32(0)
+
+NO_EXPOSURE = 255
+"""Index of a pixel that no exposure serves."""
+
+BY_INDEX, BY_LENGTH, BY_VARIANCE = 0, 1, 2
+"""How exposures are chosen: a given index, the longest unsaturated one, all by inverse variance."""
+
+
+class Fused(NamedTuple):
+    """Where fused phasors go."""
+
+    cosine: Any  # float32[k, p]
+    sine: Any  # float32[k, p]
+    mean: Any  # float32[k, p]
+    sigma_gray: Any  # float32[p]
+    exposure_index: Any  # uint8[p]
+    saturated_samples: Any  # uint16[p]
+    reasons: Any  # uint16[p]
+
+
+class Exposures(NamedTuple):
+    """The exposures of a fusion."""
+
+    order: Any  # int64[e]: longest first
+    exposure_ms: Any  # float32[e]
+    variance_gray2: Any  # float32[e]
+    per_gray: Any  # float32[e]
+    black_gray: float
+
+
+@row_loop
+def _weigh(
+    exposure_ms: Any,
+    exposure: Any,
+    usable: Any,
+    variance: Any,
+    weight: Any,
+    total: Any,
+    best: Any,
+    best_ms: Any,
+    index: Any,
+) -> None:
+    """Add one exposure's weight t^2/sigma^2 where it counts; remember the weightiest exposure."""
+    for i in range(total.size):
+        share = exposure_ms * exposure_ms / variance[i]
+        share = share if usable[i] != VALID else ZERO
+        weight[i] = share / exposure_ms
+        total[i] += share
+        better = share > best[i]
+        best[i] = share if better else best[i]
+        best_ms[i] = exposure_ms if better else best_ms[i]
+        index[i] = exposure if better else index[i]
+
+
+@row_loop
+def _usable_unsaturated(peak: Any, saturation: Any, usable: Any) -> None:
+    for i in range(usable.size):
+        usable[i] = np.int32(1) if np.float32(peak[i]) < saturation else VALID
+
+
+@row_loop
+def _usable_first(index: Any, usable: Any) -> None:
+    for i in range(usable.size):
+        usable[i] = usable[i] if index[i] == np.int32(NO_EXPOSURE) else VALID
+
+
+@row_loop
+def _usable_wanted(wanted: Any, exposure: Any, usable: Any) -> None:
+    for i in range(usable.size):
+        usable[i] = np.int32(1) if np.int32(wanted[i]) == exposure else VALID
+
+
+@row_loop
+def _flag_usable_saturated(peak: Any, saturation: Any, usable: Any, reasons: Any) -> None:
+    for i in range(reasons.size):
+        bad = usable[i] != VALID and np.float32(peak[i]) >= saturation
+        reasons[i] |= _SATURATED if bad else VALID
+
+
+@row_loop
+def _add_weighted(row: Any, offset: Any, weight: Any, total: Any) -> None:
+    for i in range(total.size):
+        total[i] += weight[i] * (row[i] - offset)
+
+
+@row_loop
+def _scales_of(total: Any, best_ms: Any, scale: Any) -> None:
+    for i in range(total.size):
+        scale[i] = best_ms[i] / total[i] if total[i] > ZERO else ZERO
+
+
+@row_loop
+def _rescale(scale: Any, offset: Any, row: Any) -> None:
+    for i in range(row.size):
+        row[i] = row[i] * scale[i] + offset
+
+
+@row_loop
+def _store_fused(
+    total: Any,
+    best_ms: Any,
+    index: Any,
+    reasons: Any,
+    missing: Any,
+    sigma_gray: Any,
+    exposure_index: Any,
+    reasons_out: Any,
+) -> None:
+    for i in range(total.size):
+        served = index[i] != np.int32(NO_EXPOSURE)
+        sigma_gray[i] = best_ms[i] / np.sqrt(total[i]) if served else NAN
+        exposure_index[i] = np.uint8(index[i])
+        reasons_out[i] = np.uint16(reasons[i] if served else missing)
+
+
+@row_loop
+def _fuse_block(
+    addresses: Any,
+    sample: Any,
+    n_px: Any,
+    block: Any,
+    steps: Any,
+    exposures: Any,
+    wanted: Any,
+    mode: Any,
+    saturation: Any,
+    fused: Any,
+) -> None:
+    n_frequencies = steps.first_frame.size - 1
+    n_frames = steps.first_frame[n_frequencies]
+    rows = new_rows(n_frequencies)
+    peaks = np.empty(TILE, sample.dtype)
+    index_row, usable_row = np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+    single = rows.single
+    for start in range(block, min(block + BLOCK, n_px), TILE):
+        n = min(TILE, n_px - start)
+        end = start + n
+        weight, total, best, best_ms = single[0, :n], single[1, :n], single[2, :n], single[3, :n]
+        mean, variance, scale = single[4, :n], single[5, :n], single[6, :n]
+        index, usable, reasons, peak = index_row[:n], usable_row[:n], rows.reasons[:n], peaks[:n]
+        fill(total, ZERO)
+        fill(best, ZERO)
+        fill(best_ms, ZERO)
+        fill(index, NO_EXPOSURE)
+        fill(reasons, VALID)
+        fill(fused.saturated_samples[start:end], 0)
+        for k in range(n_frequencies):
+            fill(fused.cosine[k, start:end], ZERO)
+            fill(fused.sine[k, start:end], ZERO)
+            fill(fused.mean[k, start:end], ZERO)
+        for place in range(exposures.order.size):
+            exposure = exposures.order[place]
+            first = exposure * n_frames
+            black = np.float32(exposures.black_gray)
+            demodulate(
+                addresses[first : first + n_frames],
+                sample,
+                start,
+                n,
+                steps,
+                rows.cosine,
+                rows.sine,
+                rows.mean,
+                peak,
+            )
+            for frame in range(first, first + n_frames):
+                count_saturated(
+                    frame_part(addresses[frame], start, n, sample),
+                    np.float32(saturation),
+                    fused.saturated_samples[start:end],
+                )
+            average(rows.mean, 0, mean)
+            predict_variance(
+                mean,
+                exposures.variance_gray2[exposure],
+                exposures.per_gray[exposure],
+                black,
+                variance,
+            )
+            if mode == BY_INDEX:
+                _usable_wanted(wanted[start:end], np.int32(exposure), usable)
+                _flag_usable_saturated(peak, np.float32(saturation), usable, reasons)
+            else:
+                _usable_unsaturated(peak, np.float32(saturation), usable)
+            if mode == BY_LENGTH:
+                _usable_first(index, usable)
+            _weigh(
+                exposures.exposure_ms[exposure],
+                np.int32(exposure),
+                usable,
+                variance,
+                weight,
+                total,
+                best,
+                best_ms,
+                index,
+            )
+            for k in range(n_frequencies):
+                _add_weighted(rows.cosine[k, :n], ZERO, weight, fused.cosine[k, start:end])
+                _add_weighted(rows.sine[k, :n], ZERO, weight, fused.sine[k, start:end])
+                _add_weighted(rows.mean[k, :n], black, weight, fused.mean[k, start:end])
+        _scales_of(total, best_ms, scale)
+        for k in range(n_frequencies):
+            _rescale(scale, ZERO, fused.cosine[k, start:end])
+            _rescale(scale, ZERO, fused.sine[k, start:end])
+            _rescale(scale, np.float32(exposures.black_gray), fused.mean[k, start:end])
+        missing = _DARK if mode == BY_INDEX else _SATURATED
+        _store_fused(
+            total,
+            best_ms,
+            index,
+            reasons,
+            missing,
+            fused.sigma_gray[start:end],
+            fused.exposure_index[start:end],
+            fused.reasons[start:end],
+        )
+
+
+@kernel
+def fuse_exposures(
+    addresses: Any,
+    sample: Any,
+    n_px: Any,
+    steps: Any,
+    exposures: Any,
+    wanted: Any,
+    mode: Any,
+    saturation: Any,
+    fused: Any,
+) -> None:
+    """Fuse the frames of several exposures into phasors, see `phasors.fuse_exposures`."""
+    for block in numba.prange((n_px + BLOCK - 1) // BLOCK):
+        _fuse_block(
+            addresses,
+            sample,
+            n_px,
+            block * BLOCK,
+            steps,
+            exposures,
+            wanted,
+            mode,
+            saturation,
+            fused,
+        )
+
+
+@row_loop
+def _add_square_misfit(
+    frame: Any, cosine_weight: Any, sine_weight: Any, cosine: Any, sine: Any, mean: Any, total: Any
+) -> None:
+    for i in range(frame.size):
+        d = np.float32(frame[i]) - (mean[i] + cosine_weight * cosine[i] - sine_weight * sine[i])
+        total[i] += d * d
+
+
+@row_loop
+def _store_rms(total: Any, inverse_freedom: Any, rms: Any) -> None:
+    for i in range(total.size):
+        rms[i] = np.sqrt(total[i] * inverse_freedom)
+
+
+@row_loop
+def _misfit_block(
+    addresses: Any,
+    sample: Any,
+    n_px: Any,
+    block: Any,
+    steps: Any,
+    design: Any,
+    inverse_freedom: Any,
+    rms: Any,
+) -> None:
+    rows = new_rows(steps.first_frame.size - 1)
+    peaks = np.empty(TILE, sample.dtype)
+    total_row = rows.single[0]
+    for start in range(block, min(block + BLOCK, n_px), TILE):
+        n = min(TILE, n_px - start)
+        total = total_row[:n]
+        demodulate(addresses, sample, start, n, steps, rows.cosine, rows.sine, rows.mean, peaks[:n])
+        fill(total, ZERO)
+        for k in range(steps.first_frame.size - 1):
+            for frame in range(steps.first_frame[k], steps.first_frame[k + 1]):
+                _add_square_misfit(
+                    frame_part(addresses[frame], start, n, sample),
+                    design[0, frame],
+                    design[1, frame],
+                    rows.cosine[k, :n],
+                    rows.sine[k, :n],
+                    rows.mean[k, :n],
+                    total,
+                )
+        _store_rms(total, inverse_freedom, rms[start : start + n])
+
+
+@kernel
+def sinusoid_misfit(
+    addresses: Any, sample: Any, n_px: Any, steps: Any, design: Any, inverse_freedom: Any, rms: Any
+) -> None:
+    """Measure the rms distance of the frames from the sinusoids, see `phasors.sinusoid_misfit`."""
+    for block in numba.prange((n_px + BLOCK - 1) // BLOCK):
+        _misfit_block(addresses, sample, n_px, block * BLOCK, steps, design, inverse_freedom, rms)
