@@ -23,6 +23,9 @@ from backend.numerics.histogram import dark_level, pooled_histogram
 
 MAX_CAPTURES = 10
 
+GLARE_SHARE = 0.015
+"""Less light than this share of the picture's mean is what the lens scatters, not what the part returns."""
+
 
 class PreExposureParams(Params):
     """How the exposure of the preview is found."""
@@ -293,4 +296,5 @@ class _Signal:
             take = (gray < facts.full_scale_gray - 1) | (rate == 0)
             rate[take] = signal[take] / np.float32(t_ms)
             foreground |= signal > limit_gray
-        return cls(np.maximum(rate, 0.0), foreground)
+        rate = np.maximum(rate, 0.0)
+        return cls(rate, foreground & (rate > GLARE_SHARE * rate.mean()))
