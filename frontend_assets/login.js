@@ -1,8 +1,9 @@
 "use strict";
 // A link from elsewhere brings no cookie along (SameSite=Strict): whoever is logged in goes on from here.
 const next = document.querySelector("input[name=next]").value;
-fetch("/api/me", { cache: "no-store" })
-  .then((answer) => { if (answer.ok) location.replace(next); })
+fetch("/login/who", { cache: "no-store" })
+  .then((answer) => answer.json())
+  .then((known) => { if (known.user) location.replace(next); })
   .catch(() => {});
 
 // The name is remembered on this machine, the token never.

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import httpx
 from fastapi import Depends, Request
@@ -15,6 +15,7 @@ from backend.api.sessions import Sessions
 Services = Any  # until the services are there
 
 
+@runtime_checkable
 class Upstream(Protocol):
     """Where the station is: asked anew for each request, because it may have been restarted."""
 

@@ -3,7 +3,7 @@
 from urllib.parse import quote, urlsplit
 
 from fastapi import APIRouter, Request
-from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
 from backend.api.access import address_of, same_origin, session_of
 from backend.api.assets import PUBLIC, asset, filled
@@ -34,6 +34,13 @@ async def login_form(request: Request, next: str = HOME) -> Response:  # noqa: A
     if session_of(request) is not None:
         return RedirectResponse(own_address(next), 303)
     return _login_page(request, own_address(next))
+
+
+@router.get("/login/who")
+async def who_is_logged_in(request: Request) -> Response:
+    """Tell the login page whether there is a session already, which a link from elsewhere can't show."""
+    session = session_of(request)
+    return JSONResponse({"user": session.user if session else None})
 
 
 @router.post("/login")
@@ -93,7 +100,7 @@ async def import_form(request: Request) -> Response:
     if session is None:
         return login_page_for(request)
     limit = context_of(request).upload_limit_bytes
-    return HTMLResponse(filled("import.html", user=session.user, limit=f"{limit / 2**30:.3g} GiB"))
+    return HTMLResponse(filled("import.html", user=session.user, limit=f"{limit / 2**20:,.0f} MiB"))
 
 
 @router.get("/assets/{name}")

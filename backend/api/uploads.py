@@ -5,11 +5,10 @@ import stat
 import tempfile
 import zipfile
 import zlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from errno import EDQUOT, EEXIST, EISDIR, ENAMETOOLONG, ENOSPC, ENOTDIR
 from pathlib import Path, PurePosixPath
-from typing import IO
 
 from starlette.concurrency import run_in_threadpool
 
@@ -96,7 +95,7 @@ def unpack(archive: Path, folder: Path, limit_bytes: int) -> Path:
                 target = folder / _inner_path(member)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with zipped.open(member) as source, target.open("xb") as file:
-                    left_bytes -= _copy(source, file, left_bytes, limit_bytes)
+                    left_bytes -= _copy(source.read, file.write, left_bytes, limit_bytes)
     except (zipfile.BadZipFile, EOFError, RuntimeError, zlib.error) as error:
         raise InvalidCaptureError(  # RuntimeError: encrypted, or packed by a method that we don't know
             f"The upload is no readable zip file ({error}); zip the capture's folder again."
@@ -125,13 +124,18 @@ def _inner_path(member: zipfile.ZipInfo) -> Path:
     return Path(*path.parts)
 
 
-def _copy(source: IO[bytes], file: IO[bytes], left_bytes: int, limit_bytes: int) -> int:
+def _copy(
+    read: Callable[[int], bytes],
+    write: Callable[[bytes], int],
+    left_bytes: int,
+    limit_bytes: int,
+) -> int:
     copied = 0
-    while piece := source.read(_WRITE_BYTES):
+    while piece := read(_WRITE_BYTES):
         copied += len(piece)
         if copied > left_bytes:
             raise too_large(limit_bytes)
-        file.write(piece)
+        write(piece)
     return copied
 
 

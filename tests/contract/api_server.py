@@ -1,0 +1,74 @@
+"""The API on a real port, in this process: tests speak HTTP and websocket to it."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+from fastapi import FastAPI
+
+from backend.api.application import create_api
+from backend.api.context import Context
+from backend.api.server import public_socket, server_for
+from backend.api.sessions import Sessions, Tokens
+
+OPERATOR_TOKEN = "operators-only-7431"
+VIEWER_TOKEN = "viewers-only-1290"
+COOKIE = "unglare-test"
+
+
+@dataclass
+class Upstream:
+    """Where a test says that the station is."""
+
+    port: int | None = None
+    secret: str = "known to proxy and station"
+    message: str = "The station is starting."
+
+
+@contextlib.contextmanager
+def serving(app: FastAPI) -> Iterator[str]:
+    """Serve an application on a free loopback port; yields its address."""
+    listening = public_socket("127.0.0.1", 0)
+    port = listening.getsockname()[1]
+    server = server_for(app, log_level="warning")
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        server.should_exit = True
+        thread.join(timeout=30)
+        assert not thread.is_alive()
+
+
+def api(services: Any, data_folder: Path, **changes: Any) -> FastAPI:
+    """Make the application around services; `changes` go into its context."""
+    values: dict[str, Any] = {
+        "services": services,
+        "sessions": Sessions(Tokens(OPERATOR_TOKEN, VIEWER_TOKEN)),
+        "station": Upstream(),
+        "http": httpx.AsyncClient(trust_env=False),
+        "version": "0.0.test",
+        "cookie_name": COOKIE,
+        "data_folder": data_folder,
+        "upload_limit_bytes": 2**20,
+    }
+    return create_api(Context(**(values | changes)))
+
+
+def browser(address: str, token: str = OPERATOR_TOKEN, name: str = "Ada") -> httpx.Client:
+    """Log in as a browser does: with a cookie, and an Origin on whatever changes something."""
+    client = httpx.Client(base_url=address, headers={"Origin": address}, trust_env=False)
+    answer = client.post("/login", data={"name": name, "token": token})
+    assert answer.status_code == 303, answer.text
+    return client
+
+
+def program(address: str, token: str = OPERATOR_TOKEN) -> httpx.Client:
+    """Be a program: a token with every request, no cookie."""
+    headers = {"Authorization": f"Bearer {token}"}
+    return httpx.Client(base_url=address, headers=headers, trust_env=False)
