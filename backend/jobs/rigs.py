@@ -1,12 +1,13 @@
 """The rigs in use: opened when first needed, used by one thread each, lent to one capture at a time."""
 
+import itertools
 import json
 import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -52,6 +53,8 @@ class LivePicture:
 
     gray: np.ndarray[Any, np.dtype[Any]]
     bit_depth: int
+    number: int = field(default_factory=itertools.count().__next__)
+    """Tells two pictures apart."""
 
 
 class Lease:

@@ -1,0 +1,31 @@
+"""What every use case works with: made once by the composition root, never changed."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+
+from backend.contract.rigs import RigOffer
+from backend.jobs.rigs import RigPool
+from backend.jobs.runner import Runner
+from backend.methods import Registry
+from backend.services.events import EventHub
+from backend.services.previews import PreviewCache
+from backend.services.rig_offers import offer_rigs
+from backend.storage.artifacts import ArtifactStore
+from backend.storage.database import Database, utc_now
+
+
+@dataclass(frozen=True)
+class Context:
+    """Database, store, runner, rigs, methods, events."""
+
+    database: Database
+    store: ArtifactStore
+    runner: Runner
+    rigs: RigPool
+    registry: Registry
+    events: EventHub
+    version: str
+    clock: Callable[[], datetime] = utc_now
+    offers: Callable[[], tuple[RigOffer, ...]] = offer_rigs
+    previews: PreviewCache = field(default_factory=PreviewCache)

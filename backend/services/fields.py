@@ -1,0 +1,118 @@
+"""The shown fields of a stored result, read from its document: no array is loaded."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any
+
+from backend.contract.scans import ArtifactRef, FieldView, FrameRef
+from backend.domain.hints import Hint
+from backend.domain.stage import shown_fields
+
+_SIBLINGS = ("x", "fit", "valleys", "peaks", "normals", "colour", "faces")
+"""Attributes of hints that name another field of the same result."""
+
+
+@dataclass(frozen=True)
+class _Shown:
+    name: str
+    hint: dict[str, Any]
+    per_camera: bool
+
+
+def field_views(result_type: type, document: Mapping[str, Any]) -> tuple[FieldView, ...]:
+    """Describe every shown field, and those that a hint refers to.
+
+    A field without a hint of its own that another one's hint names (the axis of a curve) comes with the kind
+    `data`: there to be fetched, not to be shown.
+    """
+    return tuple(
+        _view(shown, document[shown.name])
+        for shown in _shown(result_type)
+        if shown.name in document
+    )
+
+
+def point_count(result_type: type, document: Mapping[str, Any]) -> int | None:
+    """Return how many points a result has; None if it isn't a cloud."""
+    for view in field_views(result_type, document):
+        if view.hint["kind"] == "points":
+            return math.prod(view.arrays[""].shape[:-1]) if "" in view.arrays else None
+    return None
+
+
+def plain(value: Any) -> Any:
+    """Return a stored value as JSON for a client: NaN and infinity are None, arrays become references."""
+    if isinstance(value, Mapping):
+        if "$float" in value:
+            return None
+        if "$array" in value:
+            return _artifact(value).model_dump(mode="json")
+        return {name: plain(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [plain(inner) for inner in value]
+    return value
+
+
+@lru_cache(maxsize=256)
+def _shown(result_type: type) -> tuple[_Shown, ...]:
+    shown = [_Shown(f.name, f.hint.describe(), f.per_camera) for f in shown_fields(result_type)]
+    named = {name for f in shown_fields(result_type) for name in _named_siblings(f.hint)}
+    named -= {s.name for s in shown}
+    hidden = [f.name for f in fields(result_type) if f.name in named]
+    return (*shown, *(_Shown(name, {"kind": "data", "title": name}, False) for name in hidden))
+
+
+def _named_siblings(hint: Hint) -> Iterator[str]:
+    for attribute in _SIBLINGS:
+        name = getattr(hint, attribute, None)
+        if isinstance(name, str):
+            yield name
+    yield from getattr(hint, "scalars", ())
+
+
+def _view(shown: _Shown, value: Any) -> FieldView:
+    view = FieldView(name=shown.name, hint=shown.hint, per_camera=shown.per_camera)
+    if shown.hint["kind"] == "frames":
+        return view.model_copy(update={"frames": tuple(_frames(value))})
+    by_camera = value if _is_per_camera(shown, value) else {"": value}
+    arrays = {camera: _artifact(v) for camera, v in by_camera.items() if _is_array(v)}
+    if arrays:
+        return view.model_copy(update={"arrays": arrays})
+    return view.model_copy(update={"value": plain(value)})
+
+
+def _is_per_camera(shown: _Shown, value: Any) -> bool:
+    if not isinstance(value, Mapping) or _is_array(value):
+        return False
+    return shown.per_camera or (bool(value) and all(_is_array(v) for v in value.values()))
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, Mapping) and "$array" in value
+
+
+def _artifact(value: Mapping[str, Any]) -> ArtifactRef:
+    # model_construct: a scan has hundreds of them, and the store wrote what is in the document.
+    return ArtifactRef.model_construct(
+        hash=value["$array"], shape=tuple(value["shape"]), dtype=value["dtype"]
+    )
+
+
+def _frames(value: Any) -> Iterator[FrameRef]:
+    """Find the frames in whatever a stage keeps them in: a tuple, one per camera, nested."""
+    if isinstance(value, Mapping) and "$frame" in value:
+        frame = value["$frame"]
+        yield FrameRef.model_construct(
+            camera=frame["camera"],
+            pattern=frame["pattern"],
+            exposure_ms=plain(frame["exposure_ms"]),
+            gain_db=frame["gain_db"],
+            role=frame["role"],
+            bit_depth=frame["bit_depth"],
+            image=_artifact(frame["image"]),
+        )
+    elif isinstance(value, Mapping | list):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            yield from _frames(inner)

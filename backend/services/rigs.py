@@ -1,0 +1,157 @@
+"""What clients may know of rigs: offers, views, checks, live pictures."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from backend.contract.rigs import (
+    CameraView,
+    PinholeView,
+    PoseView,
+    ProjectorView,
+    RigCheck,
+    RigOffer,
+    RigView,
+)
+from backend.devices.protocols import Device, Rig
+from backend.domain.errors import StageUnavailableError, UnglareError
+from backend.domain.rig import PinholeModel, Pose, RigCalibration, RigFacts
+from backend.jobs.rigs import RigGiven
+from backend.services.context import Context
+from backend.services.previews import live_jpeg
+from backend.storage.codec import decode
+
+
+def view_rig(context: Context, name: str, options: Mapping[str, Any]) -> RigView:
+    """Describe a rig with its options; opens it unless it is known already."""
+    return rig_view(name, _title(context, name), options, context.rigs.given(name, options))
+
+
+def view_scan_rig(context: Context, scan: str) -> RigView:
+    """Describe the rig as a scan has it: what was handed over when it was made, also if it is gone since.
+
+    Raises
+    ------
+    StageUnavailableError
+        If the scan has no facts of a rig (yet).
+    """
+    with context.database.reading() as repositories:
+        row = repositories.scans.get(scan)
+        given = repositories.given.of(scan)
+    if RigFacts.__name__ not in given:
+        raise StageUnavailableError(
+            f"Scan {row.name or row.id!r} knows nothing of its rig yet: it is asked at the first run."
+        )
+    facts = decode(given[RigFacts.__name__].document, RigFacts, context.store)
+    known = given.get(RigCalibration.__name__)
+    calibration = decode(known.document, RigCalibration, context.store) if known else None
+    title = _title(context, row.rig) if row.rig else "Imported frames"
+    return rig_view(row.rig, title, row.rig_options, RigGiven(facts, calibration))
+
+
+def check_rig(context: Context, name: str, options: Mapping[str, Any]) -> RigCheck:
+    """Open a rig and say who its devices are; what goes wrong is a line, not an error."""
+    try:
+        lines = context.rigs.use(name, options, _lines)
+    except UnglareError as error:
+        return RigCheck(name=name, ok=False, lines=(error.sentence,))
+    return RigCheck(name=name, ok=True, lines=lines)
+
+
+def live_frame(context: Context, rig: str, camera: str) -> bytes | None:
+    """Return the newest picture of a camera as JPEG, None if there is none; never waits."""
+    picture = context.rigs.live(rig, camera)
+    if picture is None:
+        return None
+    key = ("live", rig, camera, picture.number)
+    return context.previews.get(key, lambda: live_jpeg(picture.gray, picture.bit_depth))
+
+
+def rig_view(name: str, title: str, options: Mapping[str, Any], rig: RigGiven) -> RigView:
+    """Write facts and calibration as a client gets them."""
+    return RigView(
+        name=name,
+        title=title,
+        options=dict(options),
+        reference=rig.facts.reference,
+        cameras=tuple(_camera(camera, rig) for camera in rig.facts.cameras),
+        projector=_projector(rig),
+    )
+
+
+def _camera(name: str, rig: RigGiven) -> CameraView:
+    facts, calibration = rig.facts.cameras[name], rig.calibration
+    return CameraView(
+        name=name,
+        width_px=facts.width_px,
+        height_px=facts.height_px,
+        bit_depth=facts.bit_depth,
+        exposure_min_ms=facts.exposure_min_ms,
+        exposure_max_ms=facts.exposure_max_ms,
+        model=_pinhole(calibration.cameras.get(name)) if calibration else None,
+        camera_from_world=_pose(calibration.camera_from_world.get(name)) if calibration else None,
+    )
+
+
+def _projector(rig: RigGiven) -> ProjectorView | None:
+    facts, calibration = rig.facts.projector, rig.calibration
+    if facts is None:
+        return None
+    return ProjectorView(
+        width_px=facts.width_px,
+        height_px=facts.height_px,
+        frame_period_ms=facts.frame_period_ms,
+        model=_pinhole(calibration.projector) if calibration else None,
+        projector_from_world=_pose(calibration.projector_from_world) if calibration else None,
+    )
+
+
+def _pinhole(model: PinholeModel | None) -> PinholeView | None:
+    if model is None:
+        return None
+    return PinholeView(
+        width_px=model.width_px,
+        height_px=model.height_px,
+        K=_rows(model.K),
+        distortion=tuple(model.distortion.tolist()),
+    )
+
+
+def _pose(pose: Pose | None) -> PoseView | None:
+    if pose is None:
+        return None
+    return PoseView(R=_rows(pose.R), t_mm=tuple(pose.t_mm.tolist()))
+
+
+def _rows(matrix: np.ndarray[tuple[int, ...], np.dtype[Any]]) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+def _title(context: Context, name: str) -> str:
+    titles = {offer.name: offer.title for offer in context.offers()}
+    return titles.get(name, name)
+
+
+def offers(context: Context) -> tuple[RigOffer, ...]:
+    """Return the rigs that a scan can be made with."""
+    return context.offers()
+
+
+def _lines(rig: Rig) -> tuple[str, ...]:
+    facts = rig.facts()
+    cameras = [
+        f"{_who(camera)}: {facts.cameras[name].width_px} x {facts.cameras[name].height_px} px, "
+        f"{facts.cameras[name].exposure_min_ms:g} to {facts.cameras[name].exposure_max_ms:g} ms"
+        for name, camera in rig.cameras.items()
+    ]
+    width_px, height_px = rig.projector.capabilities.size
+    projector = f"{_who(rig.projector)}: {width_px} x {height_px} px"
+    calibration = "calibrated" if rig.calibration() else "no calibration: no points, only phase"
+    return (*cameras, projector, calibration)
+
+
+def _who(device: Device) -> str:
+    info = device.info
+    serial = f" {info.serial}" if info.serial else ""
+    return f"{device.name}: {info.vendor} {info.model}{serial}, {device.state.value}"

@@ -1,0 +1,239 @@
+"""Every use case under one roof: what the API and the command line call. Each is one transaction."""
+
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from backend.contract.descriptions import MethodDescription, MethodList
+from backend.contract.requests import (
+    CreateScan,
+    Decide,
+    EditSettings,
+    RedoStage,
+    StartRun,
+    UndoEdit,
+)
+from backend.contract.rigs import RigCheck, RigOffer, RigView
+from backend.contract.scans import AuditEntry, ScanState, ScanSummary
+from backend.domain.errors import ConflictError
+from backend.jobs.loading import load_scan
+from backend.jobs.recovery import recover
+from backend.jobs.rigs import RigPool
+from backend.jobs.runner import Runner
+from backend.methods import Registry
+from backend.services import editing, rigs, running, scans
+from backend.services.context import Context
+from backend.services.events import EventHub
+from backend.services.points import pack_points
+from backend.services.previews import Format, Kind, draw, value_at
+from backend.services.rig_offers import offer_rigs
+from backend.services.states import scan_state
+from backend.storage.artifacts import ArtifactStore
+from backend.storage.database import Database, utc_now
+from backend.storage.repositories.statistics import Counts
+
+
+class Services:
+    """The application's use cases.
+
+    Parameters
+    ----------
+    database, store, runner, rigs, registry
+        What they work with. `runner` and `rigs` have to publish to `events`.
+    events
+        Where clients listen.
+    version
+        The application's version.
+    clock
+        Now, in UTC.
+    offers
+        Which rigs there are to choose from.
+    """
+
+    def __init__(
+        self,
+        *,
+        database: Database,
+        store: ArtifactStore,
+        runner: Runner,
+        rigs: RigPool,
+        registry: Registry,
+        events: EventHub,
+        version: str,
+        clock: Callable[[], datetime] = utc_now,
+        offers: Callable[[], tuple[RigOffer, ...]] = offer_rigs,
+    ) -> None:
+        self.context = Context(
+            database=database,
+            store=store,
+            runner=runner,
+            rigs=rigs,
+            registry=registry,
+            events=events,
+            version=version,
+            clock=clock,
+            offers=offers,
+        )
+
+    @property
+    def events(self) -> EventHub:
+        """Where clients listen."""
+        return self.context.events
+
+    def recover(self) -> int:
+        """Mark what a killed process left as running; once, at the start of the process that owns the jobs."""
+        return recover(self.context.database)
+
+    def close(self) -> None:
+        """Interrupt what runs, so that it can be continued, and give rigs and database back."""
+        self.context.runner.close()
+        self.context.rigs.close()
+        self.context.database.close()
+
+    # methods and scans
+
+    def methods(self) -> MethodList:
+        """Describe all methods, and say which plug-ins failed to load."""
+        registry = self.context.registry
+        described = [registry.methods[name].describe() for name in sorted(registry.methods)]
+        return MethodList(
+            methods=tuple(MethodDescription.model_validate(d) for d in described),
+            broken=dict(registry.broken),
+        )
+
+    def create_scan(self, request: CreateScan, who: str) -> ScanState:
+        """Make a scan; see `scans.create_scan`."""
+        return scans.create_scan(self.context, request, who)
+
+    def scan(self, scan: str) -> ScanState:
+        """Return a scan's state; NotFoundError if there is none of that id."""
+        with self.context.database.reading() as repositories:
+            return scan_state(self.context, repositories, scan)
+
+    def scans(self, limit: int = 50, offset: int = 0, text: str = "") -> tuple[ScanSummary, ...]:
+        """Return a page of the scan list, newest first; `text` is looked for in names, notes, operators."""
+        return scans.list_scans(self.context, limit, offset, text)
+
+    def audit(self, scan: str) -> tuple[AuditEntry, ...]:
+        """Return who did what to a scan, oldest first."""
+        return scans.audit_trail(self.context, scan)
+
+    def statistics(self) -> Counts:
+        """Count scans, jobs, frames and runs, for those who watch the system."""
+        with self.context.database.reading() as repositories:
+            return repositories.statistics.counts()
+
+    # changes
+
+    def edit(self, scan: str, stage: str, request: EditSettings, who: str) -> ScanState:
+        """Change settings of a stage; see `editing.edit`."""
+        return editing.edit(self.context, scan, stage, request, who)
+
+    def redo(self, scan: str, stage: str | None, request: RedoStage, who: str) -> ScanState:
+        """Take pictures again; see `editing.redo`."""
+        return editing.redo(self.context, scan, stage, request, who)
+
+    def undo(self, scan: str, request: UndoEdit, who: str) -> ScanState:
+        """Take back the last edit; see `editing.undo`."""
+        return editing.undo(self.context, scan, request, who)
+
+    # runs
+
+    def run(self, scan: str, request: StartRun, who: str) -> ScanState:
+        """Run what isn't current; see `running.run`."""
+        return running.run(self.context, scan, request, who)
+
+    def cancel(self, scan: str, who: str) -> ScanState:
+        """End the scan's job; see `running.cancel`."""
+        return running.cancel(self.context, scan, who)
+
+    def decide(self, stage_run: str, request: Decide, who: str) -> ScanState:
+        """Accept or reject a result; see `running.decide`."""
+        return running.decide(self.context, stage_run, request, who)
+
+    def wait(self, scan: str, timeout_s: float | None = None) -> ScanState:
+        """Wait until the scan's job has ended (the command line does) and return the state.
+
+        Raises
+        ------
+        ConflictError
+            If it hasn't ended in time.
+        """
+        with self.context.database.reading() as repositories:
+            job = repositories.jobs.last_of(scan)
+        if job is not None and not self.context.runner.wait(job.id, timeout_s):
+            raise ConflictError(f"The run of scan {scan} hasn't ended after {timeout_s} s.")
+        return self.scan(scan)
+
+    # arrays
+
+    def artifact(self, hash: str) -> np.ndarray[tuple[int, ...], np.dtype[Any]]:
+        """Return an array, mapped, read only."""
+        return self.context.store.get(hash)
+
+    def artifact_preview(
+        self,
+        hash: str,
+        *,
+        max_px: int = 1280,
+        colormap: str = "gray",
+        low: float | None = None,
+        high: float | None = None,
+        kind: Kind = "picture",
+        format: Format = "png",
+    ) -> bytes:
+        """Return an array as a picture; see `previews.draw`."""
+        return self.context.previews.get(
+            (hash, max_px, colormap, low, high, kind, format),
+            lambda: draw(
+                self.artifact(hash),
+                max_px=max_px,
+                colormap=colormap,
+                low=low,
+                high=high,
+                kind=kind,
+                format=format,
+            ),
+        )
+
+    def artifact_at(self, hash: str, x: int, y: int) -> Any:
+        """Return what an array says at column x of row y; None where it isn't finite."""
+        return value_at(self.artifact(hash), x, y)
+
+    def cloud_preview(
+        self, stage_run: str, field: str, *, budget: int = 300_000, scalar: str | None = None
+    ) -> bytes:
+        """Return a cloud thinned to at most `budget` points; see `points.pack_points`."""
+        with self.context.database.reading() as repositories:
+            run = repositories.runs.get(stage_run)
+            method = load_scan(repositories, self.context.registry, run.scan).method
+        if run.document is None:
+            raise ConflictError(f"Stage run {stage_run} isn't finished: it has no points.")
+        output = method.stage(run.stage).output
+        return pack_points(
+            output, run.document, field, self.context.store, budget=budget, scalar=scalar
+        )
+
+    # rigs
+
+    def rigs(self) -> tuple[RigOffer, ...]:
+        """Return the rigs that a scan can be made with."""
+        return rigs.offers(self.context)
+
+    def rig(self, name: str, options: Mapping[str, Any]) -> RigView:
+        """Describe a rig; see `rigs.view_rig`."""
+        return rigs.view_rig(self.context, name, options)
+
+    def scan_rig(self, scan: str) -> RigView:
+        """Describe the rig as a scan has it; see `rigs.view_scan_rig`."""
+        return rigs.view_scan_rig(self.context, scan)
+
+    def check_rig(self, name: str, options: Mapping[str, Any]) -> RigCheck:
+        """Open a rig and say who its devices are; see `rigs.check_rig`."""
+        return rigs.check_rig(self.context, name, options)
+
+    def live_frame(self, rig: str, camera: str) -> bytes | None:
+        """Return the newest picture of a camera as JPEG; never waits."""
+        return rigs.live_frame(self.context, rig, camera)
