@@ -8,6 +8,7 @@ import contextlib
 import errno
 import fcntl
 import hashlib
+import io
 import os
 import resource
 from collections.abc import Iterator
@@ -122,7 +123,9 @@ class LocalArtifactStore:
 
     def _known_mapping(self, array: Array) -> ArtifactMeta | None:
         """Return what is known if the array is a whole artifact of this store, mapped by `get`."""
-        source = array.base
+        source: object = array
+        while type(source) is np.ndarray:
+            source = source.base
         if not isinstance(source, np.memmap) or source.filename is None:
             return None
         file = Path(source.filename)
@@ -208,9 +211,11 @@ def _remove_leftovers(folder: Path) -> None:
 
 def _write(array: Array, file: Any) -> str:
     """Write header and bytes, hash them on the way, return the hash."""
+    header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
-        file, {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape}
+        header, {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape}
     )
+    _write_all(file, header.getbuffer())
     digest = hashlib.sha256(hash_prefix(array.dtype, array.shape))
     for chunk in _chunks(array):
         digest.update(chunk)
@@ -220,9 +225,12 @@ def _write(array: Array, file: Any) -> str:
 
 def _write_all(file: Any, chunk: memoryview) -> None:
     while chunk:
-        chunk = chunk[
-            file.write(chunk) :
-        ]  # a file without a buffer may write less than it is given
+        chunk = chunk[_write_some(file, chunk) :]
+
+
+def _write_some(file: Any, chunk: memoryview) -> int:
+    """Write what the system takes at once: without a buffer that may be less than it is given."""
+    return int(file.write(chunk))
 
 
 def _digest(array: Array) -> str:
