@@ -37,6 +37,7 @@ class Matches(NamedTuple):
 
 _DEFAULTS = MatchSettings()
 _EMPTY = np.float32(np.nan)
+_ONE = np.uint64(1)
 _MANY = np.float32(np.inf)
 _NO_MATCH = np.uint16(Reason.NO_MATCH)
 _AMBIGUOUS = np.uint16(Reason.AMBIGUOUS_MATCH)
@@ -45,6 +46,10 @@ _SAME_PLACE_PX = 3.0
 """Crossings of one coordinate this near to each other are noise on one surface, not two surfaces."""
 _JUMP_STEPS = 5.0
 _CELLS_MAX = 4
+_FLATTEST = 50.0
+"""Spread of four pixels over the change along the epipolar line above which the line can't be followed."""
+_HAIR = 1e-3
+"""Overshoot in [px] that isn't worth another step to the neighbouring four pixels."""
 
 
 def match(
@@ -97,18 +102,17 @@ def match(
     _check(reference_px, other_px, rectification)
     step = _median_step(reference_px, other_px)
     jump = settings.jump_px if settings.jump_px is not None else _JUMP_STEPS * step
-    low, cells = _range(other_px, step, rectification.other.width_px)
-    grid = (low, step)
+    grid = _grid(other_px, step, rectification.other.width_px)
     pixel_of_other = rectification.pixel_of_other.map()
-    index_other = _index(other_px, pixel_of_other, rectification.other, grid, cells, jump)
-    index_reference = _reference_index(reference_px, rectification, grid, cells, jump)
+    index_other = _index(other_px, pixel_of_other, rectification.other, grid, jump)
+    index_reference = _reference_index(reference_px, rectification, grid, jump)
     out = Matches(
         np.empty(reference_px.shape, np.float32),
         np.empty(reference_px.shape, np.float32),
         np.empty(reference_px.shape, np.float32),
         np.empty(reference_px.shape, np.uint16),
     )
-    unknown = np.full((1, 1), np.nan, np.float32)
+    unknown = np.full((1, reference_px.shape[1]), np.nan, np.float32)
     _match_rows(
         reference_px,
         other_px,
@@ -116,11 +120,10 @@ def match(
         unknown if sigma_other_px is None else sigma_other_px,
         rectification.rectified_of_reference.nodes,
         pixel_of_other,
-        np.array(rectification.reference, np.int64),
-        np.array(rectification.other, np.int64),
+        np.array(rectification.other[:2], np.float64),
         index_reference,
         index_other,
-        np.array([low, step, jump, settings.agreement_px], np.float64),
+        np.array([grid.low, grid.step, jump, settings.agreement_px], np.float64),
         *out,
     )
     return out
@@ -194,8 +197,8 @@ def _median_step(
 
 
 def _steps_of(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "n"]:
-    rows = values[:: max(values.shape[0] // 128, 1)]
-    columns = values[:, :: max(values.shape[1] // 128, 1)]
+    rows = values[:: max(values.shape[0] // 64, 1)]
+    columns = values[:, :: max(values.shape[1] // 16, 1)]
     across, down = np.abs(np.diff(rows, axis=1)), np.abs(np.diff(columns, axis=0))
     across, down = across[np.isfinite(across)], down[np.isfinite(down)]
     # The coded direction is the one that changes; cameras may be mounted on their side.
@@ -204,41 +207,49 @@ def _steps_of(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "n"]:
     return across
 
 
-def _range(other_px: Float32[np.ndarray, "h2 w2"], step: float, width_px: int) -> tuple[float, int]:
+class _Grid(NamedTuple):
+    """Values of the coordinate at which an index notes the place: low + k step."""
+
+    low: float
+    step: float
+    cells: int
+
+
+def _grid(other_px: Float32[np.ndarray, "h2 w2"], step: float, width_px: int) -> _Grid:
+    """Lay about one value on each pixel of the other camera."""
     low, high = float(np.nanmin(other_px)), float(np.nanmax(other_px))
-    cells = int((high - low) / step) + 2
-    return low, min(cells, _CELLS_MAX * width_px)
+    step = max(step, (high - low) / (_CELLS_MAX * width_px))
+    # one below, for a coordinate a hair under the lowest
+    return _Grid(low - step, step, int((high - low) / step) + 4)
 
 
 def _index(
     values: Float32[np.ndarray, "h w"],
     pixel_of_canvas: Float32[np.ndarray, "2 rows columns"],
     canvas: Canvas,
-    grid: tuple[float, float],
-    cells: int,
+    grid: _Grid,
     jump: float,
 ) -> Float32[np.ndarray, "rows cells"]:
-    index = np.empty((canvas.height_px, cells), np.float32)
-    _index_rows(values, pixel_of_canvas, float(canvas.x0_px), grid[0], grid[1], jump, index)
+    index = np.empty((canvas.height_px, grid.cells), np.float32)
+    _index_rows(values, pixel_of_canvas, float(canvas.x0_px), grid.low, grid.step, jump, index)
     return index
 
 
 def _reference_index(
     reference_px: Float32[np.ndarray, "h w"],
     rectification: Rectification,
-    grid: tuple[float, float],
-    cells: int,
+    grid: _Grid,
     jump: float,
 ) -> Float32[np.ndarray, "rows cells"]:
     canvas = rectification.reference
-    index = np.empty((canvas.height_px, cells), np.float32)
+    index = np.empty((canvas.height_px, grid.cells), np.float32)
     _index_lattice_rows(
         reference_px,
         rectification.pixel_of_reference.nodes,
         canvas.width_px,
         float(canvas.x0_px),
-        grid[0],
-        grid[1],
+        grid.low,
+        grid.step,
         jump,
         index,
     )
@@ -272,7 +283,8 @@ def _crossings(row: Any, x0: Any, low: Any, step: Any, jump: Any, out: Any) -> A
         if abs(difference) <= jump_cells and difference != 0.0:  # False with NaN
             first = np.int64(np.ceil(min(before, now)))
             last = np.int64(np.floor(max(before, now)))
-            for k in range(max(first, 0), min(last, out.size - 1) + 1):
+            begin, end = max(first, np.int64(0)), min(last, np.int64(out.size - 1))
+            for k in range(begin, end + 1):
                 place = np.float32(x0 + i - 1 + (k - before) / difference)
                 if np.isnan(out[k]):
                     out[k] = place
@@ -309,86 +321,25 @@ def _index_lattice_rows(
 @row_loop
 def _look_up(index_row: Any, cell: Any) -> Any:
     """Return the place of a coordinate between two index entries, and a second one if they are far apart."""
-    k = np.int64(np.floor(cell))
-    a = index_row[k] if 0 <= k < index_row.size else _EMPTY
-    b = index_row[k + 1] if 0 <= k + 1 < index_row.size else _EMPTY
+    below = np.floor(cell)
+    if not (below >= 0.0 and below < index_row.size - 1):
+        return _EMPTY, _EMPTY
+    k = np.uint64(np.int64(below))
+    a, b = index_row[k], index_row[k + _ONE]
     if np.isnan(a):
         return b, _EMPTY
     if np.isnan(b):
         return a, _EMPTY
     if abs(a - b) <= 2.0 * _SAME_PLACE_PX:  # False if one is inf
-        return np.float32(a + (cell - k) * (b - a)), _EMPTY
-    if cell - k < 0.5:
+        return np.float32(a + (cell - below) * (b - a)), _EMPTY
+    if cell - below < 0.5:
         return a, b
     return b, a
 
 
 @row_loop
-def _refine(
-    values: Any, sigma: Any, pixel_of_canvas: Any, x: Any, y: Any, target: Any, jump: Any
-) -> Any:
-    """Follow the epipolar line from x to where the coordinate is the target.
-
-    Returns x (NaN if there is no such place nearby), slope du/dx, and the variance of u there.
-    """
-    height, width = values.shape
-    start = x
-    row = min(max(np.int64(np.floor(y)), 0), pixel_of_canvas.shape[1] - 2)
-    old_i, old_j = np.int64(-1), np.int64(-1)
-    for attempt in range(10):
-        column = np.int64(np.floor(x))
-        if column < 0 or column >= pixel_of_canvas.shape[2] - 1:
-            break
-        fx, fy = x - column, y - row
-        px00, px01 = pixel_of_canvas[0, row, column], pixel_of_canvas[0, row, column + 1]
-        py00, py01 = pixel_of_canvas[1, row, column], pixel_of_canvas[1, row, column + 1]
-        dpx, dpy = px01 - px00, py01 - py00
-        px = px00 + fx * dpx + fy * (pixel_of_canvas[0, row + 1, column] - px00)
-        py = py00 + fx * dpy + fy * (pixel_of_canvas[1, row + 1, column] - py00)
-        i, j = np.int64(np.floor(px)), np.int64(np.floor(py))
-        if i < 0 or j < 0 or i >= width - 1 or j >= height - 1:
-            break
-        u00, u01 = values[j, i], values[j, i + 1]
-        u10, u11 = values[j + 1, i], values[j + 1, i + 1]
-        spread = max(max(u00, u01), max(u10, u11)) - min(min(u00, u01), min(u10, u11))
-        # max and min may pass over NaN, the sum doesn't
-        if not (spread <= jump) or np.isnan(u00 + u01 + u10 + u11):
-            break
-        a, b = px - i, py - j
-        gx = (1.0 - b) * (u01 - u00) + b * (u11 - u10)
-        gy = (1.0 - a) * (u10 - u00) + a * (u11 - u01)
-        slope = gx * dpx + gy * dpy
-        value = (1.0 - b) * (u00 + a * (u01 - u00)) + b * (u10 + a * (u11 - u10))
-        if abs(slope) * 50.0 < spread:
-            break
-        move = (target - value) / slope
-        if attempt >= 4:
-            move *= 0.5  # two cells that send us to and fro
-        x += min(max(move, -2.0), 2.0)
-        if abs(x - start) > _SAME_PLACE_PX:
-            break
-        settled = abs(move) < 1e-4 or (i == old_i and j == old_j and abs(move) < 2e-2)
-        if settled:
-            # Still within the cell whose four pixels were used, or a hair outside
-            w00, w01 = (1.0 - a) * (1.0 - b), a * (1.0 - b)
-            w10, w11 = (1.0 - a) * b, a * b
-            variance = 0.0
-            if sigma.shape[0] == height:
-                variance = (
-                    (w00 * sigma[j, i]) ** 2
-                    + (w01 * sigma[j, i + 1]) ** 2
-                    + (w10 * sigma[j + 1, i]) ** 2
-                    + (w11 * sigma[j + 1, i + 1]) ** 2
-                )
-            return x, slope, variance
-        old_i, old_j = i, j
-    return np.nan, np.nan, np.nan
-
-
-@row_loop
-def _mutual(index_row: Any, cell: Any, x: Any, agreement: Any) -> Any:
+def _mutual(first: Any, second: Any, x: Any, agreement: Any) -> Any:
     """Tell whether the reference's own index leads from the coordinate back to x."""
-    first, second = _look_up(index_row, cell)
     if np.isnan(first):
         return True  # a sliver narrower than the index: nothing speaks against it
     # inf, two places in the reference, is never near
@@ -396,88 +347,162 @@ def _mutual(index_row: Any, cell: Any, x: Any, agreement: Any) -> Any:
 
 
 @row_loop
-def _partner(
-    values: Any,
-    sigma: Any,
-    pixel_of_canvas: Any,
-    index_row: Any,
-    cell: Any,
-    origin: Any,
-    y: Any,
-    target: Any,
-    jump: Any,
-) -> Any:
-    """Return rectified x, slope, variance and reason of one coordinate's partner."""
-    first, second = _look_up(index_row, cell)
-    if np.isinf(first) or np.isinf(second):
-        return np.nan, np.nan, np.nan, _AMBIGUOUS
-    if np.isnan(first):
-        return np.nan, np.nan, np.nan, _NO_MATCH
-    x, slope, variance = _refine(values, sigma, pixel_of_canvas, first - origin, y, target, jump)
-    if not np.isnan(second):
-        x2, slope2, variance2 = _refine(
-            values, sigma, pixel_of_canvas, second - origin, y, target, jump
-        )
-        if np.isnan(x):
-            x, slope, variance = x2, slope2, variance2
-        elif abs(x2 - x) > _SAME_PLACE_PX:
-            return np.nan, np.nan, np.nan, _AMBIGUOUS
-    if np.isnan(x):
-        return np.nan, np.nan, np.nan, _NO_MATCH
-    return x + origin, slope, variance, np.uint16(0)
-
-
-@row_loop
-def _match_row(
+def _start_row(
     targets: Any,
-    sigma_row: Any,
-    values: Any,
-    sigma: Any,
     x: Any,
-    y: Any,
-    pixel_of_canvas: Any,
-    reference: Any,
-    other: Any,
+    line: Any,
     index_reference: Any,
     index_other: Any,
     limits: Any,
+    start: Any,
+    second: Any,
+    reasons: Any,
+) -> Any:
+    """Look up where to start on each pixel's epipolar line; say whether a pixel has two places."""
+    low, scale, agreement = limits[0], 1.0 / limits[1], limits[3]
+    two_places = False
+    for i in range(targets.size):
+        start[i] = second[i] = np.nan
+        reasons[i] = 0
+        if np.isnan(targets[i]):
+            continue
+        nearest = np.floor(line[i] + 0.5)
+        if nearest < 0 or nearest >= index_other.shape[0]:
+            reasons[i] = _NO_MATCH
+            continue
+        row = np.uint64(np.int64(nearest))
+        cell = (targets[i] - low) * scale
+        first, other = _look_up(index_other[row], cell)
+        back, back_too = _look_up(index_reference[row], cell)
+        if np.isnan(first):
+            reasons[i] = _NO_MATCH
+        elif np.isinf(first) or np.isinf(other):
+            reasons[i] = _AMBIGUOUS
+        elif not _mutual(back, back_too, x[i], agreement):
+            reasons[i] = _ONE_WAY
+        else:
+            start[i], second[i] = first, other
+            two_places |= not np.isnan(other)
+    return two_places
+
+
+@row_loop
+def _refine_row(  # noqa: C901  # one loop: splitting it costs a call with 40 arguments per pixel
+    values: Any,
+    sigma: Any,
+    pixel_of_canvas: Any,
+    targets: Any,
+    start: Any,
+    line: Any,
+    x0: Any,
+    jump: Any,
+    out_x: Any,
+    out_slope: Any,
+    out_variance: Any,
+) -> Any:
+    """Follow each epipolar line from its start to where the coordinate is the target.
+
+    Writes x, the slope du/dx and the variance of u there; NaN if there is no such place nearby.
+    """
+    height, width = values.shape
+    rows, columns = pixel_of_canvas.shape[1], pixel_of_canvas.shape[2]
+    noisy = sigma.shape[0] == height
+    for n in range(targets.size):
+        out_x[n] = out_slope[n] = out_variance[n] = np.nan
+        x = start[n] - x0
+        if np.isnan(x):
+            continue
+        last = x
+        # unsigned, or each access would test for an index that counts from the end
+        row = np.uint64(min(max(np.int64(np.floor(line[n])), np.int64(0)), np.int64(rows - 2)))
+        row_below = row + _ONE
+        fy = line[n] - np.float64(row)
+        for attempt in range(10):
+            floor_x = np.floor(x)
+            if floor_x < 0 or floor_x >= columns - 1 or abs(x - last) > _SAME_PLACE_PX:
+                break
+            fx = x - floor_x
+            column = np.uint64(np.int64(floor_x))
+            px00, py00 = pixel_of_canvas[0, row, column], pixel_of_canvas[1, row, column]
+            dpx = pixel_of_canvas[0, row, column + _ONE] - px00
+            dpy = pixel_of_canvas[1, row, column + _ONE] - py00
+            px = px00 + fx * dpx + fy * (pixel_of_canvas[0, row_below, column] - px00)
+            py = py00 + fx * dpy + fy * (pixel_of_canvas[1, row_below, column] - py00)
+            floor_px, floor_py = np.floor(px), np.floor(py)
+            if floor_px < 0 or floor_py < 0 or floor_px >= width - 1 or floor_py >= height - 1:
+                break
+            a, b = px - floor_px, py - floor_py
+            i, j = np.uint64(np.int64(floor_px)), np.uint64(np.int64(floor_py))
+            right, below = i + _ONE, j + _ONE
+            u00, u01 = values[j, i], values[j, right]
+            u10, u11 = values[below, i], values[below, right]
+            spread = max(max(u00, u01), max(u10, u11)) - min(min(u00, u01), min(u10, u11))
+            # max and min may pass over NaN, the sum doesn't
+            if not (spread <= jump) or np.isnan(u00 + u01 + u10 + u11):
+                break
+            top, bottom = u01 - u00, u11 - u10
+            slope = ((1.0 - b) * top + b * bottom) * dpx
+            slope += ((1.0 - a) * (u10 - u00) + a * (u11 - u01)) * dpy
+            if abs(slope) * _FLATTEST < spread:
+                break
+            value = (1.0 - b) * (u00 + a * top) + b * (u10 + a * bottom)
+            move = (targets[n] - value) / slope
+            if attempt >= 4:
+                move *= 0.5  # two cells that send us to and fro
+            x += move
+            a, b = a + move * dpx, b + move * dpy
+            # Inside the cell whose four pixels gave the slope there is nothing left to correct.
+            if min(a, b) >= -_HAIR and max(a, b) <= 1.0 + _HAIR:
+                out_x[n], out_slope[n], out_variance[n] = x + x0, slope, 0.0
+                if noisy:
+                    out_variance[n] = (
+                        ((1.0 - a) * (1.0 - b) * sigma[j, i]) ** 2
+                        + (a * (1.0 - b) * sigma[j, right]) ** 2
+                        + ((1.0 - a) * b * sigma[below, i]) ** 2
+                        + (a * b * sigma[below, right]) ** 2
+                    )
+                break
+
+
+@row_loop
+def _choose_row(
+    second: Any,
+    x: Any,
+    slope: Any,
+    variance: Any,
+    x2: Any,
+    slope2: Any,
+    variance2: Any,
+    reasons: Any,
+) -> Any:
+    """Where the index had two places: take the one that holds, refuse both if both do."""
+    for i in range(second.size):
+        if np.isnan(second[i]) or np.isnan(x2[i]):
+            continue
+        if np.isnan(x[i]):
+            x[i], slope[i], variance[i] = x2[i], slope2[i], variance2[i]
+        elif abs(x[i] - x2[i]) > _SAME_PLACE_PX:
+            x[i] = slope[i] = variance[i] = np.nan
+            reasons[i] = _AMBIGUOUS
+
+
+@row_loop
+def _finish_row(
+    targets: Any,
+    sigma_row: Any,
+    x: Any,
+    slope: Any,
+    variance: Any,
     out_x: Any,
     out_sigma: Any,
     out_slope: Any,
     out_reasons: Any,
 ) -> Any:
-    low, step, jump, agreement = limits[0], limits[1], limits[2], limits[3]
-    for i in range(targets.size):
-        out_x[i] = out_sigma[i] = out_slope[i] = _EMPTY
-        out_reasons[i] = 0
-        if np.isnan(targets[i]):
-            continue
-        target = np.float64(targets[i])
-        line = y[i] - other[1]
-        row = np.int64(np.floor(line + 0.5))
-        if row < 0 or row >= index_other.shape[0]:
+    for i in range(x.size):
+        out_x[i], out_slope[i] = x[i], slope[i]
+        out_sigma[i] = np.sqrt(sigma_row[i] * sigma_row[i] + variance[i]) / abs(slope[i])
+        if np.isnan(x[i]) and not np.isnan(targets[i]) and out_reasons[i] == 0:
             out_reasons[i] = _NO_MATCH
-            continue
-        cell = (target - low) / step
-        place, slope, variance, reason = _partner(
-            values,
-            sigma,
-            pixel_of_canvas,
-            index_other[row],
-            cell,
-            np.float64(other[0]),
-            line,
-            target,
-            jump,
-        )
-        if reason == 0 and not _mutual(index_reference[row], cell, x[i], agreement):
-            reason = _ONE_WAY
-        out_reasons[i] = reason
-        if reason == 0:
-            out_x[i] = place
-            out_slope[i] = slope
-            own = sigma_row[i if sigma_row.size > 1 else 0]
-            out_sigma[i] = np.sqrt(own * own + variance) / abs(slope)
 
 
 @kernel
@@ -488,8 +513,7 @@ def _match_rows(
     sigma_other: Any,
     nodes: Any,
     pixel_of_canvas: Any,
-    reference: Any,
-    other: Any,
+    corner: Any,
     index_reference: Any,
     index_other: Any,
     limits: Any,
@@ -501,24 +525,51 @@ def _match_rows(
     height, width = reference_px.shape
     known = np.int64(1 if sigma_reference.shape[0] == height else 0)
     for row in numba.prange(height):
-        x = np.empty(width, np.float64)
-        y = np.empty(width, np.float64)
+        xs = np.empty((10, width), np.float64)
         work = np.empty(nodes.shape[2], np.float64)
+        x, line, start, second = xs[0], xs[1], xs[2], xs[3]
+        found, slope, variance = xs[4], xs[5], xs[6]
         lattice_row(nodes[0], row, work, x)
-        lattice_row(nodes[1], row, work, y)
-        _match_row(
-            reference_px[row],
-            sigma_reference[np.int64(row) * known],
+        lattice_row(nodes[1], row, work, line)
+        line -= corner[1]
+        targets = reference_px[row]
+        two_places = _start_row(
+            targets, x, line, index_reference, index_other, limits, start, second, out_reasons[row]
+        )
+        _refine_row(
             other_px,
             sigma_other,
-            x,
-            y,
             pixel_of_canvas,
-            reference,
-            other,
-            index_reference,
-            index_other,
-            limits,
+            targets,
+            start,
+            line,
+            corner[0],
+            limits[2],
+            found,
+            slope,
+            variance,
+        )
+        if two_places:
+            _refine_row(
+                other_px,
+                sigma_other,
+                pixel_of_canvas,
+                targets,
+                second,
+                line,
+                corner[0],
+                limits[2],
+                xs[7],
+                xs[8],
+                xs[9],
+            )
+            _choose_row(second, found, slope, variance, xs[7], xs[8], xs[9], out_reasons[row])
+        _finish_row(
+            targets,
+            sigma_reference[np.int64(row) * known],
+            found,
+            slope,
+            variance,
             out_x[row],
             out_sigma[row],
             out_slope[row],

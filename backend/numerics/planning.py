@@ -412,7 +412,7 @@ def _combined(
 def _cost(
     information: Float[np.ndarray, "*any"], coding: FringeCoding, limits: ServiceLimits
 ) -> Float[np.ndarray, "*any"]:
-    """Expected squared phase error: noise, plus the penalty for no phase or a wrong fringe order."""
+    """Return the expected squared phase error: noise, plus the penalty for no phase or a wrong fringe order."""
     sigma = 1 / np.sqrt(np.maximum(information, 1e-12))
     wrong_order = np.minimum(2.4 * ndtr(-coding.order_distance_rad / sigma), 1.0)
     expected = sigma**2 + wrong_order * limits.penalty_rad2
