@@ -6,6 +6,7 @@ MODULES = (
     "backend.numerics.absolute_phase",
     "backend.numerics.phasors",
     "backend.numerics.gray_code",
+    "backend.numerics.warm_up_geometry",
 )
 """Modules with kernels: each has a function `warm_up_kernels()` that runs them on tiny arrays."""
 
