@@ -33,8 +33,11 @@ from backend.stages.zones import Zones
 Strategy = Literal["planned", "hdrsia", "single_low", "single_high"]
 Budget = Literal["fast", "balanced", "thorough"]
 
-BUDGET_S: dict[Budget, float] = {"fast": 5.0, "balanced": 15.0, "thorough": 45.0}
+BUDGET_S: dict[Budget, float] = {"fast": 6.0, "balanced": 20.0, "thorough": 60.0}
 """Light time of all fringes that each budget allows."""
+
+WORTHWHILE_GAIN = 0.1
+"""One exposure more is planned as long as it lowers the mean phase variance by this share."""
 
 
 class ExposuresParams(Params):
@@ -48,7 +51,7 @@ class ExposuresParams(Params):
     )
     """Automatic: chosen by the strategy."""
     budget: Budget = setting("balanced", title="Time budget")
-    """fast 5 s, balanced 15 s, thorough 45 s of light for all fringes."""
+    """fast 6 s, balanced 20 s, thorough 60 s of light for all fringes."""
     budget_s: float | None = setting(
         None, title="Time budget in seconds", unit="s", auto="budget_used_s", gt=0, le=3600
     )
@@ -248,6 +251,7 @@ class _Planner:
             count_range=(self.params.least, self.params.most),
             coding=self.coding,
             fusion=self.fusion,
+            gain_min=WORTHWHILE_GAIN,
         ).chosen
 
     def _outside(self, wanted_ms: Float[np.ndarray, "exposure"]) -> bool:

@@ -1,0 +1,330 @@
+"""From absolute phase to points: matching two cameras (or camera and projector), triangulation, filters."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float32, UInt16
+
+from backend.domain.errors import StageFailedError
+from backend.domain.params import Params, setting
+from backend.domain.rig import RigCalibration
+from backend.domain.shots import Progress
+from backend.domain.stage import stage
+from backend.domain.states import Review
+from backend.numerics import filters
+from backend.numerics.camera_model import Pinhole, RigidTransform
+from backend.numerics.confirmation import confirmed
+from backend.numerics.filters import Kept
+from backend.numerics.matching import MatchSettings, match
+from backend.numerics.normals import normals
+from backend.numerics.reasons import Reason
+from backend.numerics.rectification import rectify
+from backend.numerics.triangulation import (
+    Cloud as OrganisedCloud,
+)
+from backend.numerics.triangulation import (
+    projector_consistency,
+    triangulate_pair,
+    triangulate_projector,
+)
+from backend.stages.cloud import Cloud, FilterRow, colour_of, enough_points, precise_enough
+from backend.stages.fringe_phase import AbsolutePhase
+from backend.stages.pre_exposure import Preview
+from backend.stages.rig_geometry import (
+    from_reference,
+    pinhole,
+    projector_from_reference,
+    require_camera,
+)
+
+Geometry = Literal["stereo", "projector"]
+Box = Annotated[tuple[float, float, float, float, float, float], "x, y, z from; x, y, z to"]
+
+
+class StereoCloudParams(Params):
+    """How points are made and which are kept."""
+
+    geometry: Geometry | None = setting(None, title="Points from", auto=None)
+    """stereo: two cameras; projector: reference camera and calibrated projector. Automatic: two cameras where
+    there are two."""
+    agreement_px: float = setting(2.0, title="Left-right agreement", unit="px", gt=0, le=50)
+    """A partner has to lead back to within this distance."""
+    jump_px: float | None = setting(
+        None, title="Jump between neighbours", unit="px", gt=0, le=500, advanced=True
+    )
+    """Neighbours whose projector coordinate differs by more are not one surface. Automatic: 5 median steps."""
+    settle_by_projector: bool = setting(True, title="Settle doubts by the projector")
+    """Where the match is ambiguous and the projector is calibrated, take the place that all three agree on."""
+    consistency_px: float | None = setting(
+        1.0, title="Contradiction with the projector", unit="px", gt=0, le=100
+    )
+    """Points whose place in the calibrated projector differs by more from the measured coordinate
+    (beyond 5 sigma) are second reflections; empty switches the check off."""
+    outlier_sigmas: float = setting(6.0, title="Outliers beyond", unit="sigma", ge=0, le=100)
+    """Points so far from the median of their 5x5 neighbourhood, and alone there, are removed; 0 = off."""
+    speck_px: int = setting(12, title="Smallest patch", unit="px", ge=0, le=100_000)
+    """Connected patches of fewer pixels are removed; 0 = off."""
+    sigma_max_mm: float | None = setting(
+        None, title="Largest uncertainty", unit="mm", gt=0, le=1000
+    )
+    box_mm: Box | None = setting(None, title="Clipping box", unit="mm")
+    """x, y, z from, then to, in the reference camera's frame; empty: everything."""
+
+
+@stage(title="Cloud", version=1, review=Review.ALWAYS, checks=(enough_points, precise_enough))
+def stereo_cloud(
+    phase: AbsolutePhase,
+    calibration: RigCalibration,
+    preview: Preview | None,
+    params: StereoCloudParams,
+    progress: Progress,
+) -> Cloud:
+    """Match the cameras along epipolar lines, triangulate, and filter: one point per pixel of the reference."""
+    scene = _Scene.of(phase, calibration, params)
+    progress(0.1, "matching")
+    raw = scene.stereo() if scene.other is not None else scene.from_projector()
+    progress(0.6, "filters")
+    rows = [scene.apply(*step, raw) for step in scene.filters(raw)]
+    progress(0.8, "normals")
+    brightness = None if preview is None else preview.rate_gray_per_ms.get(calibration.reference)
+    return scene.cloud(raw, tuple(rows), brightness)
+
+
+@dataclass
+class _Raw:
+    """The organised cloud while filters work on it."""
+
+    points_mm: Float32[np.ndarray, "h w 3"]
+    sigma_mm: Float32[np.ndarray, "h w"]
+    reasons: UInt16[np.ndarray, "h w"]
+
+
+_Filter = Callable[[_Raw], Kept]
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The maps and devices that take part."""
+
+    phase: AbsolutePhase
+    calibration: RigCalibration
+    params: StereoCloudParams
+    name: str
+    camera: Pinhole
+    other: str | None
+    """Name of the second camera; None: the projector takes its part."""
+    projector: Pinhole | None
+    projector_from_camera: RigidTransform | None
+
+    @classmethod
+    def of(
+        cls, phase: AbsolutePhase, calibration: RigCalibration, params: StereoCloudParams
+    ) -> "_Scene":
+        """Choose the geometry, or say what is missing for it."""
+        name = calibration.reference
+        maps = phase.projector_px or phase.projector_row_px
+        if name not in maps:
+            raise StageFailedError(
+                f"The reference camera {name!r} has no phase (there is one of: {', '.join(maps)}): capture it too."
+            )
+        others = [n for n in phase.projector_px if n != name and n in calibration.cameras]
+        projector_pose = projector_from_reference(calibration)
+        geometry = params.geometry or ("stereo" if others else "projector")
+        if geometry == "stereo" and not others:
+            raise StageFailedError(
+                "Stereo needs a second calibrated camera: choose points from the projector."
+            )
+        if geometry == "projector" and projector_pose is None:
+            raise StageFailedError(
+                "Points from one camera need a calibrated projector: calibrate it or capture with two cameras."
+            )
+        projector = (
+            None
+            if projector_pose is None or calibration.projector is None
+            else pinhole(calibration.projector)
+        )
+        return cls(
+            phase=phase,
+            calibration=calibration,
+            params=params,
+            name=name,
+            camera=require_camera(calibration, name),
+            other=others[0] if geometry == "stereo" else None,
+            projector=projector,
+            projector_from_camera=projector_pose,
+        )
+
+    def stereo(self) -> _Raw:
+        """Match and triangulate two cameras; settle doubtful matches by the projector."""
+        assert self.other is not None, "stereo was chosen because there is one"
+        other = require_camera(self.calibration, self.other)
+        pose = from_reference(self.calibration, self.calibration.camera_from_world[self.other])
+        rectification = rectify(self.camera, other, pose)
+        matches = match(
+            self.phase.projector_px[self.name],
+            self.phase.projector_px[self.other],
+            rectification,
+            sigma_reference_px=self.phase.sigma_px[self.name],
+            sigma_other_px=self.phase.sigma_px[self.other],
+            settings=MatchSettings(self.params.jump_px, self.params.agreement_px),
+        )
+        cloud = triangulate_pair(matches, rectification)
+        raw = _Raw(cloud.points_mm, cloud.sigma_mm, self.phase.reasons[self.name] | matches.reasons)
+        if self.params.settle_by_projector:
+            self._settle(raw, other, pose)
+        return raw
+
+    def from_projector(self) -> _Raw:
+        """Intersect the reference camera's rays with the planes of the projector's columns (or rows)."""
+        rows = self.name not in self.phase.projector_px
+        cloud = self._projector_cloud(rows)
+        reasons = self.phase.reasons[self.name].copy()
+        missing = (reasons == 0) & ~filters.valid_points(cloud.points_mm)
+        reasons[missing] |= np.uint16(Reason.NO_MATCH)
+        return _Raw(cloud.points_mm, cloud.sigma_mm, reasons)
+
+    def _projector_cloud(self, rows: bool) -> OrganisedCloud:
+        assert self.projector is not None
+        assert self.projector_from_camera is not None
+        maps = self.phase.projector_row_px if rows else self.phase.projector_px
+        sigma = self.phase.sigma_row_px if rows else self.phase.sigma_px
+        return triangulate_projector(
+            maps[self.name],
+            self.camera,
+            self.projector,
+            self.projector_from_camera,
+            sigma_projector_px=sigma[self.name],
+            rows=rows,
+        )
+
+    def _settle(self, raw: _Raw, other: Pinhole, other_from_camera: RigidTransform) -> None:
+        """Take the projector's word for pixels without a clear partner, where the other camera confirms it."""
+        if self.projector is None or self.other is None:
+            return
+        coordinate = self.phase.projector_px[self.name]
+        doubtful = np.isfinite(coordinate) & ~filters.valid_points(raw.points_mm)
+        single = self._projector_cloud(rows=False)
+        doubtful &= filters.valid_points(single.points_mm)
+        y, x = np.nonzero(doubtful)
+        sigma_px = self.phase.sigma_px[self.name][y, x] * np.float32(1.5)
+        agreed = confirmed(
+            single.points_mm[y, x],
+            coordinate[y, x],
+            self.phase.projector_px[self.other],
+            other,
+            other_from_camera,
+            sigma_px=sigma_px,
+        )
+        y, x = y[agreed], x[agreed]
+        raw.points_mm[y, x] = single.points_mm[y, x]
+        raw.sigma_mm[y, x] = single.sigma_mm[y, x]
+        raw.reasons[y, x] = 0
+
+    def filters(self, raw: _Raw) -> list[tuple[str, Reason, _Filter]]:
+        """List the filters that are switched on, in the order of their application."""
+        p = self.params
+        angle = filters.pixel_angle(self.camera.K)
+        steps: list[tuple[str, Reason, _Filter]] = []
+        if p.consistency_px is not None and self._checks_projector():
+            steps.append(("contradicts the projector", Reason.EPIPOLAR, self._consistent))
+        if p.sigma_max_mm is not None:
+            limit = p.sigma_max_mm
+            steps.append(
+                (
+                    "too uncertain",
+                    Reason.OUTLIER,
+                    lambda r: filters.within_limits(r.points_mm, r.sigma_mm, highest=limit),
+                )
+            )
+        if p.box_mm is not None:
+            box = p.box_mm
+            steps.append(
+                (
+                    "outside the box",
+                    Reason.CLIPPED,
+                    lambda r: filters.within_box(r.points_mm, box[:3], box[3:]),
+                )
+            )
+        if p.outlier_sigmas > 0:
+            steps.append(
+                (
+                    "outliers",
+                    Reason.OUTLIER,
+                    lambda r: filters.without_outliers(
+                        r.points_mm,
+                        sigma_mm=r.sigma_mm,
+                        pixel_angle_rad=angle,
+                        factor=p.outlier_sigmas,
+                    ),
+                )
+            )
+        if p.speck_px > 1:
+            steps.append(
+                (
+                    "specks",
+                    Reason.OUTLIER,
+                    lambda r: filters.without_specks(
+                        r.points_mm, least_pixels=p.speck_px, pixel_angle_rad=angle
+                    ),
+                )
+            )
+        return steps
+
+    def _checks_projector(self) -> bool:
+        """Tell whether the projector has something to add to what the points were made from."""
+        return self.projector is not None and (
+            self.other is not None or bool(self.phase.projector_row_px)
+        )
+
+    def _consistent(self, raw: _Raw) -> Kept:
+        assert self.projector is not None
+        assert self.projector_from_camera is not None
+        assert self.params.consistency_px is not None
+        rows = self.other is None
+        maps = self.phase.projector_row_px if rows else self.phase.projector_px
+        sigma = (self.phase.sigma_row_px if rows else self.phase.sigma_px)[self.name]
+        contradiction = projector_consistency(
+            raw.points_mm, maps[self.name], self.projector, self.projector_from_camera, rows=rows
+        )
+        beyond_noise = np.abs(contradiction) - np.float32(5.0) * np.nan_to_num(sigma)
+        return filters.within_limits(
+            raw.points_mm, beyond_noise, highest=self.params.consistency_px
+        )
+
+    def apply(self, title: str, reason: Reason, keep: _Filter, raw: _Raw) -> FilterRow:
+        """Apply one filter: remove its points and note why."""
+        before = filters.valid_points(raw.points_mm)
+        kept = keep(raw)
+        raw.reasons[before & ~kept.keep] |= np.uint16(reason)
+        filters.remove(raw.points_mm, kept)
+        return FilterRow(title, kept.removed)
+
+    def cloud(
+        self, raw: _Raw, rows: tuple[FilterRow, ...], brightness: Float32[np.ndarray, "h w"] | None
+    ) -> Cloud:
+        """Gather the points that are left."""
+        valid = filters.valid_points(raw.points_mm)
+        if not valid.any():
+            raise StageFailedError(
+                "No point is left: look at why pixels are missing, and loosen the filter or limit that removes most."
+            )
+        y, x = np.nonzero(valid)
+        decoded = int(np.count_nonzero(self.phase.reasons[self.name] == 0))
+        sigma = raw.sigma_mm[valid]
+        return Cloud(
+            points_mm=raw.points_mm[valid],
+            normals=np.nan_to_num(normals(raw.points_mm, self.camera)[valid]),
+            colour=colour_of(brightness, valid),
+            sigma_mm=sigma,
+            pixel_x=x.astype(np.float32),
+            pixel_y=y.astype(np.float32),
+            exposure_index=self.phase.exposure_index[self.name][valid],
+            depth_mm={self.name: np.ascontiguousarray(raw.points_mm[..., 2])},
+            reasons={self.name: raw.reasons},
+            removed=rows,
+            point_count=int(np.count_nonzero(valid)),
+            median_sigma_mm=float(np.median(sigma)),
+            kept_share=int(np.count_nonzero(valid)) / max(decoded, 1),
+        )
