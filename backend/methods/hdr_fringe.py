@@ -5,7 +5,7 @@ Source: "High dynamic range saturation intelligence avoidance for three-dimensio
 
 from backend.domain.method import Method
 from backend.stages.exposures import exposures
-from backend.stages.fringe_capture import fringe_capture, fringe_frames
+from backend.stages.fringe_capture import fringe_capture, import_fringes
 from backend.stages.fringe_phase import fringe_phase
 from backend.stages.fusion import fusion
 from backend.stages.pre_exposure import pre_exposure
@@ -26,5 +26,5 @@ METHOD = Method(
             "fringe_phase.unwrapping": "cascade",
         },
     },
-    importers={"fringe_capture": fringe_frames},
+    importers={"fringe_capture": import_fringes},
 )

@@ -8,7 +8,7 @@ the new scan's journal, and the capturing stages run again by driving their plan
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ from pydantic import ValidationError
 
 from backend.contract.capture import CapturedFrame, JournalPlace
 from backend.contract.scan_file import SCAN_FORMAT, ScanFile
+from backend.contract.scans import ScanState
 from backend.domain.errors import InvalidCaptureError
 from backend.domain.frames import Frame
 from backend.domain.ids import new_id
 from backend.domain.method import Method
-from backend.domain.rig import RigCalibration, RigFacts
+from backend.domain.rig import RigCalibration
 from backend.domain.shots import Progress, Shot
 from backend.jobs.edits import FIRST_TAKE, check_recipe
 from backend.jobs.journal import shot_document, shot_hash
@@ -28,13 +29,25 @@ from backend.jobs.loading import NO_RIG
 from backend.methods import Registry
 from backend.services.capture_calibration import capture_calibration
 from backend.services.capture_folder import CaptureFolder, capture_facts, open_capture
+from backend.services.context import Context
 from backend.services.portable import read_array, read_back
+from backend.services.states import scan_state
+from backend.services.telling import announce
 from backend.storage.artifacts import ArtifactStore, StoredPixels
 from backend.storage.codec import content_hash, decode, encode
-from backend.storage.database import Database
+from backend.storage.database import Database, utc_now
 from backend.storage.rows import FrameRow, GivenRow, ScanRow
 
-_OF_RIG = (RigFacts, RigCalibration)
+
+def import_capture(
+    context: Context, path: Path, *, name: str, who: str, progress: Progress | None = None
+) -> ScanState:
+    """Import a captured folder as a new scan; see `Importer.run`."""
+    importer = Importer(context.database, context.store, context.registry, context.clock)
+    scan = importer.run(path, who=who, name=name, progress=progress)
+    with context.database.reading() as repositories:
+        state = scan_state(context, repositories, scan)
+    return announce(context, state)
 
 
 @dataclass(frozen=True)
@@ -43,8 +56,8 @@ class Importer:
 
     database: Database
     store: ArtifactStore
-    registry: Callable[[], Registry]
-    now: Callable[[], datetime] = lambda: datetime.now(UTC)
+    registry: Registry
+    now: Callable[[], datetime] = utc_now
 
     def run(self, path: Path, *, who: str, name: str = "", progress: Progress | None = None) -> str:
         """Import `capture.json` (or the folder it is in) and return the new scan's id; nothing runs yet.
@@ -57,7 +70,7 @@ class Importer:
             If there is no room for the frames.
         """
         folder = open_capture(path)
-        method = self.registry().get(folder.capture.method)
+        method = self.registry.get(folder.capture.method)
         plan = _ImportPlan(folder, method, _scan_file(folder))
         calibration = capture_calibration(folder.capture)  # before hundreds of frames are read
         recipe = plan.recipe()

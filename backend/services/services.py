@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,13 @@ from backend.contract.requests import (
 from backend.contract.rigs import RigCheck, RigOffer, RigView
 from backend.contract.scans import AuditEntry, ScanState, ScanSummary
 from backend.domain.errors import ConflictError
+from backend.domain.shots import Progress
 from backend.jobs.loading import load_scan
 from backend.jobs.recovery import recover
 from backend.jobs.rigs import RigPool
 from backend.jobs.runner import Runner
 from backend.methods import Registry
-from backend.services import editing, rigs, running, scans
+from backend.services import editing, importing, rigs, running, scans
 from backend.services.context import Context
 from backend.services.events import EventHub
 from backend.services.points import pack_points
@@ -124,6 +126,16 @@ class Services:
         """Count scans, jobs, frames and runs, for those who watch the system."""
         with self.context.database.reading() as repositories:
             return repositories.statistics.counts()
+
+    # captured folders
+
+    def import_capture(
+        self, path: str, name: str, who: str, progress: Progress | None = None
+    ) -> ScanState:
+        """Import a captured folder as a new scan; see `importing.import_capture`."""
+        return importing.import_capture(
+            self.context, Path(path), name=name, who=who, progress=progress
+        )
 
     # changes
 

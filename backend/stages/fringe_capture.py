@@ -14,6 +14,7 @@ from backend.domain.shots import Burst, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Level, Review
 from backend.stages.exposures import Exposures
+from backend.stages.fringe_sets import fringe_sets
 from backend.stages.intensity_mask import IntensityMask
 
 
@@ -74,6 +75,12 @@ def fringe_frames(frames: tuple[Frame, ...]) -> FringeFrames:
     cameras = max(1, len({f.camera for f in frames}))
     light_ms = sum(f.exposure_ms or 0.0 for f in frames) / cameras
     return FringeFrames(frames, len(frames), light_ms / 1000.0)
+
+
+def import_fringes(frames: tuple[Frame, ...]) -> FringeFrames:
+    """Make the result of imported frames; refuses incomplete sets, passes over other patterns."""
+    fringe_sets(frames)
+    return fringe_frames(frames)
 
 
 def _burst(

@@ -23,7 +23,7 @@ EYE = [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 @pytest.fixture
 def importer(sqlite_database, store):
-    return Importer(sqlite_database, store, capture_folders.registry)
+    return Importer(sqlite_database, store, capture_folders.registry())
 
 
 def given(importer: Importer, scan: str):
