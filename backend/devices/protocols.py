@@ -15,7 +15,7 @@ A camera's life::
 import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
@@ -163,6 +163,7 @@ class Presented:
     """False: submitted, not known to be lit. Wait at least a frame period before exposing."""
 
 
+@runtime_checkable
 class Device(Protocol):
     """What cameras and projectors have in common. One thread at a time, except where noted."""
 
@@ -201,7 +202,7 @@ class Device(Protocol):
         """
         ...
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Device":
         """Open."""
         ...
 
@@ -210,6 +211,7 @@ class Device(Protocol):
         ...
 
 
+@runtime_checkable
 class Camera(Device, Protocol):
     """A camera. `configure` and `arm`, then `trigger` and `get_frame` once per picture."""
 
@@ -268,6 +270,7 @@ class Camera(Device, Protocol):
         ...
 
 
+@runtime_checkable
 class Projector(Device, Protocol):
     """A projector, or the screen of a deflectometry rig."""
 
@@ -316,6 +319,7 @@ class SequenceProjector(Projector, Protocol):
         ...
 
 
+@runtime_checkable
 class Rig(Protocol):
     """Cameras and a projector that look at the same scene; for deflectometry the projector is a screen."""
 
@@ -355,7 +359,7 @@ class Rig(Protocol):
         """Return the calibration that the rig hands over, None where it has none. Called after `open`."""
         ...
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Rig":
         """Open."""
         ...
 

@@ -7,10 +7,11 @@ plans are deterministic, so the same frames lead to the same shots.
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from math import isfinite
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -30,7 +31,11 @@ from backend.storage.rows import FrameRow
 
 T = TypeVar("T")
 
+_MOST_UNWRITTEN = 4
+"""Shots that may wait to be written: memory for a disk that is slow now and then, no more."""
 
+
+@runtime_checkable
 class Seen(Protocol):
     """Is told of every picture at once: for the live preview and the event stream."""
 
@@ -108,17 +113,40 @@ class CaptureSession:
     def _burst(self, burst: Burst) -> tuple[Exposed, ...]:
         asked = [self._ask(shot) for shot in burst]
         known = [self._known(shares) for shares in asked]
-        missing = [i for i, frames in enumerate(known) if len(frames) < len(asked[i])]
+        missing = {
+            i: [share for share in shares if share.camera not in known[i]]
+            for i, shares in enumerate(asked)
+            if len(known[i]) < len(shares)
+        }
+        try:
+            taken = self._capture(burst, missing)
+        except DeviceError as error:
+            raise self._failed(error) from error
+        return tuple(
+            {
+                share.camera: self._frame(share, (known[i] | taken.get(i, {}))[share.camera])
+                for share in shares
+            }
+            for i, shares in enumerate(asked)
+        )
+
+    def _capture(
+        self, burst: Burst, missing: Mapping[int, Sequence[_Asked]]
+    ) -> dict[int, dict[str, FrameRow]]:
+        """Take the shots that aren't in the journal; one is written while the next are exposed.
+
+        Whatever ends this, what was exposed is written first.
+        """
         pace = _Pace([burst[i].exposure_ms for i in missing], self.clock)
         self._load([burst[i] for i in missing])
-        for n, i in enumerate(missing):
-            shares = [share for share in asked[i] if share.camera not in known[i]]
-            self._tell(pace, n, len(burst), burst[i], kept=len(burst) - len(missing))
-            known[i] |= {row.camera: row for row in self._shoot(shares)}
-        return tuple(
-            {share.camera: self._frame(share, rows[share.camera]) for share in shares}
-            for shares, rows in zip(asked, known, strict=True)
-        )
+        writes: dict[int, Future[dict[str, FrameRow]]] = {}
+        with ThreadPoolExecutor(1, thread_name_prefix="journal") as writer:
+            for n, (i, shares) in enumerate(missing.items()):
+                self._tell(pace, n, len(burst), burst[i], kept=len(burst) - len(missing))
+                if n >= _MOST_UNWRITTEN:
+                    list(writes.values())[n - _MOST_UNWRITTEN].result()
+                writes[i] = writer.submit(self._keep, self._expose(shares))
+        return {i: write.result() for i, write in writes.items()}
 
     def _ask(self, shot: Shot) -> list[_Asked]:
         mask_hash = self._mask_hash(shot.mask)
@@ -138,27 +166,27 @@ class CaptureSession:
         found = {s.camera: self.journal.find(s.id, s.occurrence) for s in shares}
         return {camera: row for camera, row in found.items() if row is not None}
 
-    def _shoot(self, shares: Sequence[_Asked]) -> list[FrameRow]:
-        return [self._keep(s, frame) for s, frame in self._expose(shares)]
-
     def _expose(self, shares: Sequence[_Asked]) -> list[tuple[_Asked, DeviceFrame]]:
         shot = shares[0].shot
         assert self.shooter is not None  # `_load` refused otherwise
-        try:
-            frames = self.shooter.take(
-                self._loaded.index(_picture_id(shot.pattern, shares[0].mask_hash)),
-                exposure_ms=shot.exposure_ms,
-                gain_db=shot.gain_db,
-                cameras=[share.camera for share in shares],
-            )
-        except DeviceError as error:
-            raise self._failed(error) from error
+        frames = self.shooter.take(
+            self._loaded.index(_picture_id(shot.pattern, shares[0].mask_hash)),
+            exposure_ms=shot.exposure_ms,
+            gain_db=shot.gain_db,
+            cameras=[share.camera for share in shares],
+        )
         return [(share, frames[share.camera]) for share in shares]
 
-    def _keep(self, share: _Asked, frame: DeviceFrame) -> FrameRow:
-        """Write the picture, then its line in the journal: a crash between the two loses one shot."""
-        artifact = self.store.put(np.ascontiguousarray(frame.data))
-        row = FrameRow(
+    def _keep(self, taken: Sequence[tuple[_Asked, DeviceFrame]]) -> dict[str, FrameRow]:
+        """Write a shot's pictures, then their lines in the journal: a crash between the two loses one shot."""
+        rows = {share.camera: self._row(share, frame) for share, frame in taken}
+        self.journal.add(tuple(rows.values()))
+        for share, frame in taken:
+            self.seen(share.camera, frame, rows[share.camera])
+        return rows
+
+    def _row(self, share: _Asked, frame: DeviceFrame) -> FrameRow:
+        return FrameRow(
             scan=self.scan,
             stage=self.stage,
             take=self.take,
@@ -166,14 +194,11 @@ class CaptureSession:
             occurrence=share.occurrence,
             camera=share.camera,
             document=shot_document(share.shot, share.mask_hash),
-            artifact=artifact.hash,
+            artifact=self.store.put(np.ascontiguousarray(frame.data)).hash,
             bit_depth=frame.bits,
             when=datetime.now(UTC),
             metadata=_metadata(frame),
         )
-        self.journal.add(row)
-        self.seen(share.camera, frame, row)
-        return row
 
     def _frame(self, share: _Asked, row: FrameRow) -> Frame:
         """Hand out a frame with the exposure and gain that the camera really used."""
@@ -193,7 +218,10 @@ class CaptureSession:
         shares = self._ask(request.shot)
         rows = self._known(shares)
         if len(rows) < len(shares):
-            rows = self._wait(request, shares)
+            try:
+                rows = self._wait(request, shares)
+            except DeviceError as error:
+                raise self._failed(error) from error
         return {share.camera: self._frame(share, rows[share.camera]) for share in shares}
 
     def _wait(self, request: Until, shares: Sequence[_Asked]) -> dict[str, FrameRow]:
@@ -203,7 +231,7 @@ class CaptureSession:
             self.control.shots(None, f"waiting, {request.shot.role or 'picture'} by picture", None)
             taken = self._expose(shares)
             if request.ready({share.camera: _unsaved(share, frame) for share, frame in taken}):
-                return {share.camera: self._keep(share, frame) for share, frame in taken}
+                return self._keep(taken)
             for share, frame in taken:
                 self.seen(share.camera, frame, None)
             if self.clock() >= deadline:
@@ -225,10 +253,7 @@ class CaptureSession:
             )
         wanted = {_picture_id(s.pattern, self._mask_hash(s.mask)): s for s in shots}
         if not set(wanted) <= set(self._loaded):
-            try:
-                self.shooter.load([self._picture(s, self.shooter) for s in wanted.values()])
-            except DeviceError as error:
-                raise self._failed(error) from error
+            self.shooter.load([self._picture(s, self.shooter) for s in wanted.values()])
             self._loaded = tuple(wanted)
 
     def _picture(self, shot: Shot, shooter: Shooter) -> np.ndarray[Any, np.dtype[np.uint8]]:

@@ -7,11 +7,12 @@ job continues where it was, and an edit made meanwhile counts.
 import logging
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from backend.contract.events import Event, FrameCaptured, JobProgress, ScanChanged
 from backend.devices.protocols import Frame as DeviceFrame
@@ -47,6 +48,7 @@ from backend.storage.rows import FrameRow, JobRow
 log = logging.getLogger(__name__)
 
 
+@runtime_checkable
 class Compute(Protocol):
     """Runs a pure stage: here or in a worker process."""
 
@@ -132,7 +134,8 @@ class JobExecution:
 
     def _guarded_walk(self) -> _End:
         try:
-            self._update(status=JobStatus.RUNNING)
+            with self._writing() as repositories:
+                self._job = repositories.jobs.update(self._job.id, status=JobStatus.RUNNING)
             return self._walk()
         except CancelledError as error:
             return self._stopped(error)
@@ -184,7 +187,6 @@ class JobExecution:
 
     def _run(self, planned: PlannedStage, scan: LoadedScan) -> None:
         self.control.begin_stage(planned.name)
-        self._update(stage=planned.name)
         run, task = self._begin(planned, scan)
         began = time.monotonic()
         try:
@@ -201,7 +203,8 @@ class JobExecution:
 
     def _begin(self, planned: PlannedStage, scan: LoadedScan) -> tuple[str, StageTask]:
         assert planned.key is not None  # `_walk` opens the rig first
-        with self._shop.database.transaction() as repositories:
+        with self._writing() as repositories:
+            self._job = repositories.jobs.update(self._job.id, stage=planned.name)
             run = repositories.runs.start(
                 scan.row.id,
                 planned.name,
@@ -211,9 +214,7 @@ class JobExecution:
                 versions=self._shop.versions,
             )
             inputs = load_inputs(repositories, planned)
-        task = StageTask(scan.method.name, planned.name, planned.settings.values, inputs)
-        self._changed()
-        return run, task
+        return run, StageTask(scan.method.name, planned.name, planned.settings.values, inputs)
 
     def _capture(self, planned: PlannedStage, scan: LoadedScan, task: StageTask) -> Outcome:
         """Capture with the rig's lock held; write the result when the rig is free again."""
@@ -285,7 +286,7 @@ class JobExecution:
         worst = max(
             (Level(c["level"]) for c in outcome.checks), key=list(Level).index, default=Level.OK
         )
-        with self._shop.database.transaction() as repositories:
+        with self._writing() as repositories:
             repositories.runs.finish(
                 run,
                 outcome.document,
@@ -301,7 +302,6 @@ class JobExecution:
                 f"{stage.title} finished in {outcome.seconds or 0:.1f} s.",
                 {"run": run, "hash": outcome.hash, "level": worst.value},
             )
-        self._changed()
 
     def _note_failure(self, run: str, stage: Stage, error: Exception) -> None:
         with self._shop.database.transaction() as repositories:
@@ -332,8 +332,8 @@ class JobExecution:
     def _finish(self, end: _End) -> None:
         """Write the job's end and its line in the audit trail together."""
         progress = 1.0 if end.status is JobStatus.FINISHED else self.control.live.progress
-        with self._shop.database.transaction() as repositories:
-            repositories.jobs.update(
+        with self._writing() as repositories:
+            self._job = repositories.jobs.update(
                 self._job.id,
                 status=end.status,
                 stage=end.stage,
@@ -341,10 +341,8 @@ class JobExecution:
                 error=end.error,
                 progress=progress,
             )
-            self._job = repositories.jobs.get(self._job.id)
             if not self._failure_noted:
                 self._audit_end(repositories, end)
-        self._changed()
 
     def _audit_end(self, repositories: Repositories, end: _End) -> None:
         action, sentence = _LAST_WORDS[end.status]
@@ -357,10 +355,14 @@ class JobExecution:
             self._job.scan, who, action, end.stage, f"{sentence}{reason}", details
         )
 
-    def _update(self, **changes: Any) -> None:
+    @contextmanager
+    def _writing(self) -> Iterator[Repositories]:
+        """Write, and tell the clients when it is committed."""
         with self._shop.database.transaction() as repositories:
-            self._job = repositories.jobs.update(self._job.id, **changes)
-        self._changed()
+            yield repositories
+            revision = repositories.scans.get(self._job.scan).revision
+        self._shop.publish(ScanChanged(scan=self._job.scan, revision=revision))
+        self._tell(self.control.live)
 
     def _audit(
         self,
@@ -373,12 +375,6 @@ class JobExecution:
         repositories.audit.add(self._job.scan, self._job.who, action, stage, sentence, details)
 
     # what the clients get to know
-
-    def _changed(self) -> None:
-        with self._shop.database.reading() as repositories:
-            revision = repositories.scans.get(self._job.scan).revision
-        self._shop.publish(ScanChanged(scan=self._job.scan, revision=revision))
-        self._tell(self.control.live)
 
     def _tell(self, live: Live) -> None:
         self._shop.publish(JobProgress(scan=self._job.scan, job=job_view(self._job, live)))

@@ -1,7 +1,7 @@
 """The journal of captured frames of one take: what counts after a crash, an undo, or in a replay."""
 
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Iterable, Sequence
+from typing import Protocol, runtime_checkable
 
 from backend.domain.hashing import document_hash
 from backend.domain.shots import Shot
@@ -9,6 +9,7 @@ from backend.storage.database import Database
 from backend.storage.rows import FrameRow
 
 
+@runtime_checkable
 class Journal(Protocol):
     """Finds frames by (shot, occurrence) and takes new ones."""
 
@@ -16,8 +17,8 @@ class Journal(Protocol):
         """Return the frame that was captured for this shot, None if none was."""
         ...
 
-    def add(self, row: FrameRow) -> None:
-        """Append a frame whose artifact is in the store. From now on the frame counts."""
+    def add(self, rows: Sequence[FrameRow]) -> None:
+        """Append a shot's frames, whose artifacts are in the store, together. From now on they count."""
         ...
 
     def __len__(self) -> int:
@@ -36,10 +37,11 @@ class DatabaseJournal:
     def find(self, shot: str, occurrence: int) -> FrameRow | None:  # noqa: D102 (see Journal)
         return self._known.get((shot, occurrence))
 
-    def add(self, row: FrameRow) -> None:  # noqa: D102
+    def add(self, rows: Sequence[FrameRow]) -> None:  # noqa: D102
         with self._database.transaction() as repositories:
-            repositories.frames.add(row)
-        self._known[row.shot, row.occurrence] = row
+            for row in rows:
+                repositories.frames.add(row)
+        self._known |= _by_shot(rows)
 
     def __len__(self) -> int:
         return len(self._known)

@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from backend.jobs.control import Live
 from backend.jobs.execution import Compute, JobExecution, Workshop, compute_inline
@@ -11,6 +11,7 @@ from backend.jobs.worker import WorkerPool, WorkerSetup
 from backend.storage.rows import JobRow
 
 
+@runtime_checkable
 class Runner(Protocol):
     """Carries out jobs that are in the database already. Called from any thread."""
 

@@ -81,13 +81,19 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
+_AUTOMATIC = " or null (automatic)"
+
+
 def allowed_values(params: type[Params], field: str) -> str:
     """Say what a setting may be, e.g. `a number from 0 to 20 gray`; empty if its model is too rich for that."""
     schema = params.model_json_schema()
     described = schema["properties"][field]
     text = _describe(described, schema.get("$defs", {}))
     unit = described.get("unit")
-    return f"{text} {unit}" if text and unit else text
+    if not (text and unit):
+        return text
+    value, automatic, _ = text.partition(_AUTOMATIC)
+    return f"{value} {unit}{automatic}"
 
 
 def _describe(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:

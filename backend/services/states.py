@@ -62,10 +62,12 @@ class Assembly:
         self._job = self._job_view(self._row)
         self._latest = {run.key: run for run in loaded.runs}
         self._unattended: dict[str, bool] = {}
+        self._documents: dict[str, dict[str, Any]] = {}
 
     def state(self) -> ScanState:
         """Return everything that a screen needs, but the arrays."""
         row = self._scan.row
+        self._load_documents()
         stages = tuple(self._stage(planned) for planned in self._scan.plan.stages)
         return ScanState(
             id=row.id,
@@ -155,10 +157,14 @@ class Assembly:
         run = self._latest.get(planned.key or "")
         return run if run and run.status is RunStatus.FAILED else None
 
+    def _load_documents(self, *stages: PlannedStage) -> None:
+        runs = [p.run.id for p in stages or self._scan.plan.stages if p.run]
+        self._documents = self._repositories.runs.documents(runs)
+
     def _document(self, planned: PlannedStage) -> Mapping[str, Any] | None:
         if planned.given:
             return planned.given.document
-        return self._repositories.runs.get(planned.run.id).document if planned.run else None
+        return self._documents[planned.run.id] if planned.run else None
 
     # words
 
@@ -243,6 +249,7 @@ class Assembly:
     def _points(self) -> int | None:
         for planned in reversed(self._scan.plan.stages):
             if any(f.hint.kind == "points" for f in planned.stage.shown):
+                self._load_documents(planned)
                 document = self._document(planned)
                 return point_count(planned.stage.output, document) if document else None
         return None
