@@ -1,0 +1,236 @@
+"""The composition root: from settings to the running application."""
+
+import contextlib
+import fcntl
+import logging
+import os
+import secrets
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+from fastapi import FastAPI
+
+from backend.api.application import create_api
+from backend.api.context import Context
+from backend.api.server import TokensHidden, public_socket, server_for
+from backend.api.sessions import Sessions, Tokens
+from backend.api.station import Station
+from backend.devices.loading import open_rig
+from backend.domain.errors import StartupError
+from backend.jobs.execution import Workshop
+from backend.jobs.rigs import RigPool
+from backend.jobs.runner import LocalRunner, Runner
+from backend.methods import registry
+from backend.numerics.warm_up import warm_up
+from backend.services.events import EventHub
+from backend.services.services import Services
+from backend.settings import Settings, load_settings
+from backend.storage.artifacts import LocalArtifactStore
+from backend.storage.database import Database
+
+_log = logging.getLogger(__name__)
+_EVERYWHERE = frozenset({"0.0.0.0", "::", ""})  # noqa: S104  compared with, not bound to
+
+
+def local_runner(shop: Workshop) -> Runner:
+    """Run pure stages in a worker process whose kernels are compiled before the first scan."""
+    return LocalRunner(shop, warm_up=warm_up)
+
+
+def build_services(
+    settings: Settings, *, make_runner: Callable[[Workshop], Runner] = local_runner
+) -> Services:
+    """Open database and store, and put the services on top.
+
+    Parameters
+    ----------
+    settings
+        Where the data are.
+    make_runner
+        Makes what carries out the jobs: `local_runner` for a server, `InlineRunner` for a command.
+
+    Returns
+    -------
+    services
+        To be closed by whoever asked for them.
+
+    Raises
+    ------
+    StartupError
+        If a folder can't be written, or the database can't be opened or is too new.
+    """
+    make_folder(settings.data_folder)
+    database = Database(settings.database)
+    try:
+        database.upgrade()
+        store = LocalArtifactStore(settings.artifact_folder)
+    except BaseException:
+        database.close()
+        raise
+    events = EventHub()
+    rigs = RigPool(open_rig, events.publish)
+    shop = Workshop(database, store, rigs, registry, events.publish)
+    return Services(
+        database=database,
+        store=store,
+        runner=make_runner(shop),
+        rigs=rigs,
+        registry=registry(),
+        events=events,
+        version=version("unglare"),
+    )
+
+
+def build_application(
+    settings: Settings, services: Services, *, port: int, token: str | None = None
+) -> FastAPI:
+    """Make the application around services; nothing listens and no process runs yet.
+
+    Parameters
+    ----------
+    settings
+        Limits, tokens, folders.
+    services
+        Closed by the application when it ends.
+    port
+        Where it will be served: the station calls it there, and the cookie bears its number.
+    token
+        The operators' token; None: that of the settings.
+
+    Raises
+    ------
+    StartupError
+        If there is no operators' token at all.
+    """
+    operator = token or (settings.token.get_secret_value() if settings.token else "")
+    if not operator:
+        raise StartupError("There is no token to log in with; set UNGLARE_TOKEN.")
+    viewer = settings.viewer_token.get_secret_value() if settings.viewer_token else None
+    station = Station(f"http://{_reachable(settings.host)}:{port}")
+    context = Context(
+        services=services,
+        sessions=Sessions(Tokens(operator, viewer), lifetime_s=settings.session_hours * 3600.0),
+        station=station,
+        version=version("unglare"),
+        cookie_name=f"unglare-{port}",
+        data_folder=settings.data_folder,
+        upload_limit_bytes=settings.upload_limit_mb * 2**20,
+    )
+    return create_api(
+        context, station=station if settings.station else None, threads=settings.threads
+    )
+
+
+def serve(settings: Settings, *, announce: Callable[[str], None] = print) -> None:
+    """Serve the application until it is told to stop (Ctrl+C or SIGTERM).
+
+    Parameters
+    ----------
+    settings
+        Everything that can be chosen.
+    announce
+        Is told the addresses to open, token included, once it listens.
+
+    Raises
+    ------
+    StartupError
+        If it can't start: the port is in use, a folder can't be written, the database is too new,
+        or another server uses the same data folder.
+    """
+    configure_logging(settings.log_level)
+    # uvicorn takes the signal while it runs and raises it again when all is closed.
+    signal.signal(signal.SIGTERM, _leave)
+    token = settings.token.get_secret_value() if settings.token else secrets.token_urlsafe(24)
+    with (
+        contextlib.closing(public_socket(settings.host, settings.port)) as listening,
+        _alone_in(settings.data_folder),
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        port = listening.getsockname()[1]
+        services = build_services(settings)
+        interrupted = services.recover()
+        if interrupted:
+            _log.warning("%d runs were interrupted when the server stopped.", interrupted)
+        app = build_application(settings, services, port=port, token=token)
+        announce(_welcome(settings, port, token))
+        server_for(app, trusted_proxies=settings.trusted_proxies).run(sockets=[listening])
+
+
+def configure_logging(level: str) -> None:
+    """Write what happens to the error output, without tokens."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.addFilter(TokensHidden())
+    handler.setFormatter(
+        logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%Y-%m-%d %H:%M:%S")
+    )
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    for chatty in ("uvicorn", "uvicorn.error", "websockets", "alembic", "numba"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+
+
+def make_folder(folder: Path) -> None:
+    """Make the data folder; StartupError if that can't be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StartupError(
+            f"The data folder {folder} can't be made ({error.strerror}); choose another one with UNGLARE_DATA_FOLDER."
+        ) from error
+    if not os.access(folder, os.W_OK):
+        raise StartupError(
+            f"The data folder {folder} can't be written; change its owner, or choose another one with UNGLARE_DATA_FOLDER."
+        )
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep a second server out: it would take the first one's running jobs for interrupted."""
+    make_folder(folder)
+    with (folder / "server.lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise StartupError(
+                f"Another server uses the data folder {folder}; stop it, or choose another folder with UNGLARE_DATA_FOLDER."
+            ) from error
+        yield
+
+
+def _reachable(host: str) -> str:
+    """Return how this machine itself reaches the server, for an address."""
+    if host in _EVERYWHERE:
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host
+
+
+def _welcome(settings: Settings, port: int, token: str) -> str:
+    address = f"http://{_reachable(settings.host)}:{port}/?token={token}"
+    lines = [
+        f"unglare {version('unglare')} is running; its data are in {settings.data_folder}.",
+        "Open this address (it logs you in):",
+        f"    {address}",
+    ]
+    if settings.host in _EVERYWHERE:
+        lines.append(f"or this machine's name on port {port}, with the token {token}")
+    return "\n".join([*lines, "Stop with Ctrl+C."])
+
+
+def _leave(_signal: int, _frame: FrameType | None) -> NoReturn:
+    raise SystemExit(0)
+
+
+def main() -> None:
+    """Serve with the settings of the environment: `python -m backend.main`."""
+    try:
+        serve(load_settings())
+    except StartupError as error:
+        sys.exit(error.sentence)
+
+
+if __name__ == "__main__":
+    main()
