@@ -38,7 +38,7 @@ def create_api(context: Context, *, station: Station | None = None, threads: int
     Parameters
     ----------
     context
-        What the endpoints work with; its HTTP client is closed at the end.
+        What the endpoints work with; its services are closed at the end.
     station
         The station's process, run as long as the application; None: none is started.
     threads
@@ -93,7 +93,8 @@ def _lifespan(context: Context, station: Station | None, threads: int) -> Any:
             if running is not None:
                 running.cancel()
                 await asyncio.gather(running, return_exceptions=True)
-            await context.http.aclose()
+            # Here and not behind the server: a signal may end the process there.
+            await anyio.to_thread.run_sync(context.services.close)
 
     return lifespan
 

@@ -4,15 +4,13 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
-import httpx
 from fastapi import Depends, Request
 from starlette.requests import HTTPConnection
 
 from backend.api.sessions import Sessions
-
-Services = Any  # until the services are there
+from backend.services.services import Services
 
 
 @runtime_checkable
@@ -58,8 +56,6 @@ class Context:
     services: Services
     sessions: Sessions
     station: Upstream
-    http: httpx.AsyncClient
-    """Client for the station's page; never follows a proxy of the environment."""
     version: str
     cookie_name: str
     """One per port: browsers don't keep cookies of two ports apart."""

@@ -33,7 +33,7 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def server_for(app: FastAPI, *, trusted_proxies: str = "", log_level: str = "info") -> Server:
+def server_for(app: FastAPI, *, trusted_proxies: str = "") -> Server:
     """Make the server of an application.
 
     Parameters
@@ -46,7 +46,7 @@ def server_for(app: FastAPI, *, trusted_proxies: str = "", log_level: str = "inf
     config = uvicorn.Config(
         app,
         log_config=None,
-        log_level=log_level,
+        log_level=None,  # as the application's logging has it
         access_log=False,  # pages ask every few seconds; errors are logged where they arise
         proxy_headers=bool(trusted_proxies),
         forwarded_allow_ips=trusted_proxies or None,

@@ -21,6 +21,8 @@ _PATIENCE_S = 60.0  # viser and numpy on a cold disk
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 30.0
 _STEADY_S = 60.0  # having lived so long, the next death counts as the first
 _FAREWELL_S = 5.0
+_ITS_OWN = frozenset({"UNGLARE_POINTS_BUDGET"})
+"""Settings of the station that are passed on."""
 
 # Runs before the station, in its process: the kernel kills it when this thread of ours ends, however
 # it ends. As a program of its own and not as `preexec_fn`, which may deadlock in a threaded process.
@@ -61,7 +63,7 @@ class Station:
 
     The child finds `UNGLARE_STATION_SECRET` and `UNGLARE_API_URL` in its environment, and prints
     `{"port": N}` as one line on its standard output when it is ready. Every other line it prints goes
-    to our log.
+    to our log. Its standard input ends when we do.
 
     Parameters
     ----------
@@ -129,7 +131,7 @@ class Station:
                 _LAUNCHER,
                 str(os.getpid()),
                 *self._command,
-                stdin=asyncio.subprocess.DEVNULL,
+                stdin=asyncio.subprocess.PIPE,  # its end tells the child, on every system, that we are gone
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.STDOUT,
                 env=child_environment(os.environ, self.secret, self._api_url),
@@ -160,7 +162,7 @@ class Station:
 
 def child_environment(ours: Mapping[str, str], secret: str, api_url: str) -> dict[str, str]:
     """Return the child's environment: ours without our settings (tokens!), with what it has to know."""
-    kept = {name: value for name, value in ours.items() if not name.startswith("UNGLARE_")}
+    kept = {n: v for n, v in ours.items() if not n.startswith("UNGLARE_") or n in _ITS_OWN}
     # The command has `-P`: a folder `app` that happens to be where we were started isn't ours.
     root = str(Path(backend.__file__).resolve().parent.parent)
     paths = [root, *filter(None, [ours.get("PYTHONPATH")])]
