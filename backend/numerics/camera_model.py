@@ -158,8 +158,8 @@ def ray_lattice(camera: Pinhole, name: str = "camera") -> Lattice:
 
     Returns
     -------
-    Lattice of (x/z, y/z); interpolation is good to 1e-5 px for any lens that a
-    calibration can describe.
+    Lattice of (x/z, y/z); interpolation is good to 1e-4 px at focal lengths above
+    500 px (rounding of float32 maps included).
 
     Raises
     ------

@@ -167,14 +167,15 @@ def _check(
     other_px: Float32[np.ndarray, "h2 w2"],
     rectification: Rectification,
 ) -> None:
-    for name, values, lattice in (
-        ("reference", reference_px, rectification.rectified_of_reference),
-        ("other", other_px, None),
+    reference = rectification.rectified_of_reference
+    sizes = ((reference.width_px, reference.height_px), rectification.other_size_px)
+    for name, values, (width, height) in zip(
+        ("reference", "other"), (reference_px, other_px), sizes, strict=True
     ):
-        if lattice is not None and values.shape != (lattice.height_px, lattice.width_px):
+        if values.shape != (height, width):
             raise MatchingError(
                 f"the {name} camera's map is {values.shape[1]}x{values.shape[0]} px but its calibration"
-                f" is for {lattice.width_px}x{lattice.height_px} px; use the calibration of this size"
+                f" is for {width}x{height} px; use the calibration of this size"
             )
         if not np.isfinite(values[::7, ::7]).any() and not np.isfinite(values).any():
             raise MatchingError(
@@ -577,11 +578,18 @@ def _match_rows(
         )
 
 
+@row_loop
+def _between(plane: Any, row: Any, column: Any, fx: Any, fy: Any) -> Any:
+    corner = plane[row, column]
+    return corner + fx * (plane[row, column + 1] - corner) + fy * (plane[row + 1, column] - corner)
+
+
 @kernel
 def _sample_rows(
     values: Any, x_other: Any, nodes: Any, pixel_of_canvas: Any, other: Any, out: Any
 ) -> None:
     height, width = x_other.shape
+    rows, columns = pixel_of_canvas.shape[1], pixel_of_canvas.shape[2]
     for row in numba.prange(height):
         y = np.empty(width, np.float64)
         work = np.empty(nodes.shape[2], np.float64)
@@ -590,10 +598,11 @@ def _sample_rows(
             out[row, i] = _EMPTY
             if np.isnan(x_other[row, i]):
                 continue
-            column = np.int64(np.floor(x_other[row, i] - other[0] + 0.5))
-            line = np.int64(np.floor(y[i] - other[1] + 0.5))
-            if 0 <= line < pixel_of_canvas.shape[1] and 0 <= column < pixel_of_canvas.shape[2]:
-                px = np.int64(np.floor(pixel_of_canvas[0, line, column] + 0.5))
-                py = np.int64(np.floor(pixel_of_canvas[1, line, column] + 0.5))
-                if 0 <= px < values.shape[1] and 0 <= py < values.shape[0]:
-                    out[row, i] = values[py, px]
+            x, line = x_other[row, i] - other[0], y[i] - other[1]
+            column = min(max(np.int64(np.floor(x)), np.int64(0)), np.int64(columns - 2))
+            above = min(max(np.int64(np.floor(line)), np.int64(0)), np.int64(rows - 2))
+            px = _between(pixel_of_canvas[0], above, column, x - column, line - above)
+            py = _between(pixel_of_canvas[1], above, column, x - column, line - above)
+            nearest_x, nearest_y = np.int64(np.floor(px + 0.5)), np.int64(np.floor(py + 0.5))
+            if 0 <= nearest_x < values.shape[1] and 0 <= nearest_y < values.shape[0]:
+                out[row, i] = values[nearest_y, nearest_x]

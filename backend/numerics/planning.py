@@ -503,10 +503,10 @@ def plan_exposures(
     cost that moves one exposure, or two at once so that they can trade time.
     Cost: about 0.5 s for 90 candidates, 128 bins and 5 exposures.
     """
-    problem = _problem(light, noise, grid, budget_s, coding, limits, fusion)
     low, high = count_range
     if not 1 <= low <= high:
         raise PlanningError(f"the number of exposures is {low}..{high}; give 1 <= least <= most")
+    problem = _problem(light, noise, grid, budget_s, coding, limits, fusion, high)
     _check_budget(problem, budget_s, low)
     starts = _programme(problem, high)
     best: list[Prediction] = []
@@ -540,11 +540,12 @@ def _problem(
     coding: FringeCoding,
     limits: ServiceLimits,
     fusion: FusionKind,
+    most: int,
 ) -> _Problem:
     if not (np.isfinite(budget_s) and budget_s > 0):
         raise PlanningError(f"the time budget is {budget_s:g} s; it has to be above 0 and finite")
     budget_ms = 1000 * budget_s / coding.frames
-    times = _candidates(light, noise, grid, budget_ms, coding, limits)
+    times = _candidates(light, noise, grid, budget_ms, coding, limits, most)
     information = phase_information(light.rates_gray_per_ms, times, noise, coding, limits)
     return _Problem(
         times, information, light.pixels, budget_ms, grid.overhead_ms, coding, limits, fusion
@@ -558,6 +559,7 @@ def _candidates(
     budget_ms: float,
     coding: FringeCoding,
     limits: ServiceLimits,
+    most: int,
     number: int = 90,
 ) -> Float[np.ndarray, "candidate"]:
     """Return possible exposures, log-spaced from the brightest pixel's limit to the darkest's."""
@@ -565,7 +567,9 @@ def _candidates(
     usable = noise.full_scale_gray - limits.headroom_gray - noise.black_gray
     lit = light.rates_gray_per_ms[light.pixels > 0]
     # 0.999: just below the edge of a bin's centre, not at the mercy of rounding
-    shortest = np.clip(0.999 * usable / (coding.high_share * lit.max()), low, high)
+    bright = 0.999 * usable / (coding.high_share * lit.max())
+    # Shorter than the brightest pixel needs makes sense only if the budget is short of time.
+    shortest = np.clip(min(bright, budget_ms / (4 * most)), low, high)
     longest = np.clip(0.999 * usable / (coding.high_share * lit.min()), shortest, high)
     longest = min(longest, max(budget_ms, shortest))
     times = np.geomspace(shortest, longest, number)
@@ -582,7 +586,7 @@ def _check_budget(problem: _Problem, budget_s: float, least: int) -> None:
         )
     if spent_ms > problem.budget_ms * (1 + 1e-9):
         raise PlanningError(
-            f"the time budget of {budget_s:g} s can't hold {least} exposure(s): the shortest useful"
+            f"the time budget of {budget_s:g} s can't hold {least} exposure(s): the shortest possible"
             f" need {spent_ms * problem.coding.frames / 1000:.3g} s for {problem.coding.frames}"
             " frames each; raise the budget or lower the number of exposures or frames"
         )

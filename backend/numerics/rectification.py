@@ -52,6 +52,8 @@ class Rectification(NamedTuple):
     """Canvas of the reference -> its pixel x, y."""
     pixel_of_other: Lattice
     """Canvas of the other camera -> its pixel x, y."""
+    other_size_px: tuple[int, int]
+    """Width and height of the other camera."""
 
 
 def rectify(
@@ -110,6 +112,7 @@ def rectify(
         rectified_of_reference=_rectifying(reference, turn, focal),
         pixel_of_reference=_unrectifying(reference, turn, focal, canvases[0]),
         pixel_of_other=_unrectifying(other, turn_other, focal, canvases[1]),
+        other_size_px=(other.width_px, other.height_px),
     )
 
 
