@@ -28,7 +28,7 @@ class GrayCode(NamedTuple):
     projector_px: Float32[np.ndarray, "h w"]
     """Projector coordinate of the stripe's middle, pixel centres at integers; NaN where invalid."""
     contrast_gray: UInt16[np.ndarray, "h w"]
-    """Contrast of the weakest bit that was read, |pattern - inverse| in [gray]."""
+    """Contrast of the weakest bit that was judged, |pattern - inverse| in [gray]."""
     reasons: UInt16[np.ndarray, "h w"]
     """Why a pixel is invalid: bits of `Reason`, 0 where it is valid."""
 
@@ -41,6 +41,7 @@ def decode_gray_code(
     size_px: int,
     min_contrast_gray: float = 5.0,
     ignored_low_bits: int = 0,
+    unjudged_low_bits: int = 0,
     saturation_gray: float = float("inf"),
 ) -> GrayCode:
     r"""Decode a Gray code of which each bit was shown with its inverse.
@@ -58,6 +59,9 @@ def decode_gray_code(
         and unknown between; in [gray].
     ignored_low_bits
         Finest bits that aren't read because the optics don't resolve them: 2**n codes become one.
+    unjudged_low_bits
+        Finest of the bits read whose contrast isn't judged: where the optics don't resolve them the
+        code is 2**n stripes uncertain instead of invalid.
     saturation_gray
         A pixel is saturated where pattern and inverse of one bit both reach this gray level.
 
@@ -82,10 +86,10 @@ def decode_gray_code(
         raise FrameError(
             f"{bits} patterns but {len(inverses)} inverses were given: give both of every bit"
         )
-    read = _bits_to_read(bits, codes, ignored_low_bits)
-    frames = [*patterns[:read], *inverses[:read]]
+    reading = _reading(bits, codes, ignored_low_bits, unjudged_low_bits)
+    frames = [*patterns[: reading.read], *inverses[: reading.read]]
     return _decode(
-        frames, read, _INVERSE, bits - read, codes, size_px, min_contrast_gray, saturation_gray
+        frames, reading, _INVERSE, codes, size_px, min_contrast_gray, saturation_gray
     )
 
 
@@ -98,6 +102,7 @@ def decode_gray_code_by_reference(
     size_px: int,
     min_contrast_gray: float = 5.0,
     ignored_low_bits: int = 0,
+    unjudged_low_bits: int = 0,
     saturation_gray: float = float("inf"),
 ) -> GrayCode:
     r"""Decode a Gray code against pictures of the white and the black field.
@@ -108,7 +113,7 @@ def decode_gray_code_by_reference(
         The frames from the coarsest bit to the finest, uint8 or uint16.
     white, black
         Pictures of the white and the black field at the same exposure.
-    codes, size_px, ignored_low_bits
+    codes, size_px, ignored_low_bits, unjudged_low_bits
         As in `decode_gray_code`.
     min_contrast_gray
         A bit is unknown where :math:`|2 I - (I_w + I_b)|` isn't more than this, in [gray]; it
@@ -123,11 +128,10 @@ def decode_gray_code_by_reference(
     CodeError
         If the codes need more bits, or no bit is left to read.
     """
-    read = _bits_to_read(len(patterns), codes, ignored_low_bits)
-    frames = [*patterns[:read], white, black]
-    left_out = len(patterns) - read
+    reading = _reading(len(patterns), codes, ignored_low_bits, unjudged_low_bits)
+    frames = [*patterns[: reading.read], white, black]
     return _decode(
-        frames, read, _WHITE_BLACK, left_out, codes, size_px, min_contrast_gray, saturation_gray
+        frames, reading, _WHITE_BLACK, codes, size_px, min_contrast_gray, saturation_gray
     )
 
 
@@ -139,6 +143,7 @@ def decode_gray_code_by_threshold(
     size_px: int,
     min_contrast_gray: float = 0.0,
     ignored_low_bits: int = 0,
+    unjudged_low_bits: int = 0,
 ) -> GrayCode:
     """Decode a Gray code with one threshold for the whole picture: naive, kept for comparison.
 
@@ -146,12 +151,11 @@ def decode_gray_code_by_threshold(
     unknown where twice the distance from the threshold is less than `min_contrast_gray`, in [gray].
     For everything else see `decode_gray_code`.
     """
-    read = _bits_to_read(len(patterns), codes, ignored_low_bits)
+    reading = _reading(len(patterns), codes, ignored_low_bits, unjudged_low_bits)
     return _decode(
-        list(patterns[:read]),
-        read,
+        list(patterns[: reading.read]),
+        reading,
         _FIXED,
-        len(patterns) - read,
         codes,
         size_px,
         min_contrast_gray,
@@ -160,7 +164,15 @@ def decode_gray_code_by_threshold(
     )
 
 
-def _bits_to_read(bits: int, codes: int, ignored_low_bits: int) -> int:
+class _Reading(NamedTuple):
+    """How many of the bits are read, how many of these are judged, and how many are left out."""
+
+    read: int
+    judged: int
+    left_out: int
+
+
+def _reading(bits: int, codes: int, ignored_low_bits: int, unjudged_low_bits: int) -> _Reading:
     if codes < 1 or codes > 2**bits:
         raise CodeError(
             f"{codes} codes don't fit into {bits} bits: give 1 to {2**bits} codes or the missing frames"
@@ -169,14 +181,19 @@ def _bits_to_read(bits: int, codes: int, ignored_low_bits: int) -> int:
         raise CodeError(
             f"ignoring {ignored_low_bits} of {bits} bits leaves none to read: ignore 0 to {bits - 1}"
         )
-    return bits - ignored_low_bits
+    read = bits - ignored_low_bits
+    if not 0 <= unjudged_low_bits < read:
+        raise CodeError(
+            f"leaving {unjudged_low_bits} of {read} bits unjudged leaves none to judge: "
+            f"leave 0 to {read - 1}"
+        )
+    return _Reading(read, read - unjudged_low_bits, ignored_low_bits)
 
 
 def _decode(
     frames: Sequence[Shaped[np.ndarray, "h w"]],
-    read: int,
+    reading: _Reading,
     mode: int,
-    left_out: int,
     codes: int,
     size_px: int,
     min_contrast_gray: float,
@@ -194,13 +211,14 @@ def _decode(
         stack.addresses,
         stack.sample,
         result.code.size,
-        read,
+        reading.read,
         mode,
         _Decision(
+            judged=reading.judged,
             min_contrast=int(np.floor(min_contrast_gray)),
             double_threshold=double_threshold_gray,
             saturation=int(min(np.ceil(saturation_gray), 2**30)),
-            shift=left_out,
+            shift=reading.left_out,
             codes=codes,
             pixels_per_code=size_px / codes,
         ),
@@ -210,6 +228,7 @@ def _decode(
 
 
 class _Decision(NamedTuple):
+    judged: int
     min_contrast: int
     double_threshold: int
     saturation: int
@@ -310,21 +329,23 @@ def _decode_block(
     decision: Any,
     maps: Any,
 ) -> None:
-    rows = np.empty((5, _TILE), np.int32)
+    rows = np.empty((6, _TILE), np.int32)
     for start in range(block, min(block + _BLOCK, n_px), _TILE):
         n = min(_TILE, n_px - start)
         end = start + n
         binary, code, contrast = rows[0, :n], rows[1, :n], rows[2, :n]
-        reference, brightest = rows[3, :n], rows[4, :n]
+        reference, brightest, unjudged = rows[3, :n], rows[4, :n], rows[5, :n]
         _fill(binary, _0)
         _fill(code, _0)
         _fill(contrast, np.int32(0xFFFF))
         _fill(brightest, _0)
+        _fill(unjudged, _0)
         if mode == _INVERSE:
             for bit in range(bits):
                 pattern = frame_part(addresses[bit], start, n, sample)
                 inverse = frame_part(addresses[bits + bit], start, n, sample)
-                _read_bit(pattern, inverse, binary, code, contrast)
+                weakest = contrast if bit < decision.judged else unjudged
+                _read_bit(pattern, inverse, binary, code, weakest)
                 if decision.saturation <= 0xFFFF:
                     _keep_both_bright(pattern, inverse, brightest)
         else:
@@ -336,7 +357,8 @@ def _decode_block(
                 _add_to_reference(white, brightest)
             for bit in range(bits):
                 pattern = frame_part(addresses[bit], start, n, sample)
-                _read_bit_against(pattern, reference, binary, code, contrast)
+                weakest = contrast if bit < decision.judged else unjudged
+                _read_bit_against(pattern, reference, binary, code, weakest)
         _store(
             code,
             contrast,

@@ -89,7 +89,9 @@ class StepFit(NamedTuple):
     """Variance of the phase over (sigma_I / B)^2, averaged over all phases."""
 
 
-def step_fit(shifts_rad: Sequence[float], *, name: str = "a frequency") -> StepFit:
+def step_fit(
+    shifts_rad: Sequence[float] | Float64[np.ndarray, "n"], *, name: str = "a frequency"
+) -> StepFit:
     r"""Weigh frames of known shifts so that they give a sinusoid's phasor and mean.
 
     Parameters
@@ -127,8 +129,9 @@ def step_fit(shifts_rad: Sequence[float], *, name: str = "a frequency") -> StepF
     """
     shifts = np.asarray(shifts_rad, dtype=np.float64)
     design = np.stack([np.cos(shifts), -np.sin(shifts), np.ones_like(shifts)], axis=1)
-    spread = np.linalg.svd(design, compute_uv=False) if shifts.size >= 3 else np.zeros(3)
-    if not np.all(np.isfinite(spread)) or spread[-1] < _SINGULAR * max(spread[0], 1.0):
+    usable = shifts.size >= 3 and bool(np.all(np.isfinite(shifts)))
+    spread = np.linalg.svd(design, compute_uv=False) if usable else np.zeros(3)
+    if spread[-1] < _SINGULAR * max(spread[0], 1.0):
         degrees = ", ".join(f"{np.rad2deg(value):g}" for value in shifts)
         raise FrequencyError(
             f"the steps of {name} are at ({degrees}) degrees: "

@@ -21,7 +21,9 @@ pytestmark = pytest.mark.skipif(
 NOISE = NoiseModel(read_gray=1.0, gray_per_e=0.0)
 
 
-def load(path: str, kind: str = "sine", axis: str = "x") -> tuple[list[np.ndarray], list[dict], dict]:
+def load(
+    path: str, kind: str = "sine", axis: str = "x"
+) -> tuple[list[np.ndarray], list[dict], dict]:
     """Read the frames of one kind and axis in the order of the folder's description."""
     file = Path(os.environ["UNGLARE_DATA"]) / path
     document = json.loads(file.read_text())
@@ -38,7 +40,9 @@ def load(path: str, kind: str = "sine", axis: str = "x") -> tuple[list[np.ndarra
     return frames, [entry["pattern"] for entry in entries], document
 
 
-def fringes(path: str, axis: str = "x", *, take: slice = slice(None)) -> tuple[SineCode, list[np.ndarray], int]:
+def fringes(
+    path: str, axis: str = "x", *, take: slice = slice(None)
+) -> tuple[SineCode, list[np.ndarray], int]:
     """Read a set of fringes, or the same steps of every frequency in it."""
     frames, patterns, document = load(path, axis=axis)
     periods = tuple(dict.fromkeys(float(pattern["periods"]) for pattern in patterns))
@@ -55,9 +59,7 @@ def fringes(path: str, axis: str = "x", *, take: slice = slice(None)) -> tuple[S
 
 def wrapped(code: SineCode, frames: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Wrapped phases, and where no sample is near saturation and the fringes have contrast."""
-    phasors = fuse_exposures(
-        [frames], code, exposure_ms=[1.0], noise=NOISE, saturation_gray=253
-    )
+    phasors = fuse_exposures([frames], code, exposure_ms=[1.0], noise=NOISE, saturation_gray=253)
     valid = (phasors.reasons == 0) & (modulation_gray(phasors).min(axis=0) > 10)
     return wrapped_phase_rad(phasors), valid
 
@@ -73,7 +75,9 @@ def test_four_steps_agree_with_twelve(scene, limit_rad, first):
     assert np.sqrt((error_rad**2).mean()) <= limit_rad
 
 
-def decoded(path: str, axis: str = "x", *, take: slice = slice(None), way: str = "likelihood") -> AbsolutePhase:
+def decoded(
+    path: str, axis: str = "x", *, take: slice = slice(None), way: str = "likelihood"
+) -> AbsolutePhase:
     code, frames, size_px = fringes(path, axis, take=take)
     prepare = {"likelihood": maximum_likelihood, "cascade": cascade}[way]
     return decode_frames(
@@ -120,7 +124,9 @@ def test_box_in_both_directions_has_few_order_outliers(axis, way):
     assert valid.mean() > 0.40
     # Outliers against the median of 5 x 5 neighbours, of valid ones only.
     filled = np.where(valid, u, np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(filled, 2, constant_values=np.nan), (5, 5))
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(filled, 2, constant_values=np.nan), (5, 5)
+    )
     centre = np.full(u.shape, np.nan)
     centre[valid] = np.nanmedian(windows[valid].reshape(-1, 25), axis=1)
     size_px = 854 if axis == "x" else 480

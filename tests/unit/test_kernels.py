@@ -1,0 +1,134 @@
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from backend.numerics.errors import FrameError
+from backend.numerics.gray_code import decode_gray_code
+from backend.numerics.kernels import frame_stack, kernel_input
+
+
+def test_frames_are_taken_where_they_lie():
+    frames = [np.zeros((4, 6), np.uint16) for _ in range(3)]
+    stack = frame_stack(frames)
+    assert [int(a) for a in stack.addresses] == [frame.ctypes.data for frame in frames]
+    assert stack.shape == (4, 6)
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        ([], "no frame"),
+        ([np.zeros((4, 6), np.float32)], "frame 0 is float32"),
+        ([np.zeros((4, 6, 3), np.uint8)], r"frame 0 is uint8 of shape \(4, 6, 3\)"),
+        ([np.zeros((4, 6), np.uint8), np.zeros((6, 4), np.uint8)], "frame 1"),
+        ([np.zeros((4, 6), np.uint8), np.zeros((4, 6), np.uint16)], "frame 1 is uint16"),
+    ],
+)
+def test_frames_that_do_not_belong_together_are_refused(frames, message):
+    with pytest.raises(FrameError, match=message):
+        frame_stack(frames)
+
+
+def test_a_read_only_mapped_file_is_not_copied_and_looks_writable(tmp_path: Path):
+    np.save(tmp_path / "map.npy", np.arange(12, dtype=np.float32).reshape(3, 4))
+    mapped = np.load(tmp_path / "map.npy", mmap_mode="r")
+    plain = kernel_input(mapped)
+    assert plain.ctypes.data == mapped.ctypes.data
+    assert type(plain) is np.ndarray
+    assert plain.flags.writeable
+    assert (plain == mapped).all()
+
+
+def test_mapped_and_strided_frames_decode_like_plain_ones(tmp_path: Path):
+    rng = np.random.default_rng(1)
+    frames = [rng.integers(0, 255, (9, 14), dtype=np.uint8) for _ in range(4)]
+    np.save(tmp_path / "frame.npy", frames[0])
+    mapped = np.load(tmp_path / "frame.npy", mmap_mode="r")
+    strided = np.asfortranarray(frames[1])
+    plain = decode_gray_code(frames[:2], frames[2:], codes=4, size_px=4)
+    other = decode_gray_code([mapped, strided], frames[2:], codes=4, size_px=4)
+    assert all((a == b).all() for a, b in zip(plain, other, strict=True) if a.dtype != np.float32)
+
+
+def test_several_python_threads_may_run_kernels_at_once():
+    rng = np.random.default_rng(2)
+    frames = [rng.integers(0, 255, (64, 300), dtype=np.uint8) for _ in range(8)]
+    expected = decode_gray_code(frames[:4], frames[4:], codes=16, size_px=16).code
+    different = []
+
+    def work() -> None:
+        for _ in range(20):
+            code = decode_gray_code(frames[:4], frames[4:], codes=16, size_px=16).code
+            if not np.array_equal(code, expected):
+                different.append(code)
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not different
+
+
+_ROWS = """
+from backend.numerics.kernels import row_loop
+
+@row_loop
+def fill(row):
+    for i in range(row.size):
+        row[i] = {value}
+"""
+_KERNEL = """
+import numba
+from backend.numerics.kernels import kernel
+from rows import fill
+
+@kernel
+def run(plane):
+    for i in numba.prange(plane.shape[0]):
+        fill(plane[i])
+"""
+_MAIN = """
+import numpy as np
+from runner import run
+plane = np.zeros((2, 3))
+run(plane)
+print(plane[0, 0], sum(run.stats.cache_hits.values()))
+"""
+
+
+def test_an_edited_row_loop_in_another_file_is_compiled_again(tmp_path: Path):
+    (tmp_path / "runner.py").write_text(_KERNEL)
+    root = Path(__file__).parents[2]
+
+    def run(value: float) -> list[str]:
+        (tmp_path / "rows.py").write_text(_ROWS.format(value=value))
+        answer = subprocess.run(
+            [sys.executable, "-B", "-c", _MAIN],
+            cwd=tmp_path,
+            env={"PYTHONPATH": f"{tmp_path}:{root}", "NUMBA_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return answer.stdout.split()
+
+    assert run(1.0) == ["1.0", "0"]
+    assert run(1.0) == ["1.0", "1"]
+    assert run(2.0) == ["2.0", "0"]
+
+
+def test_importing_the_package_does_not_import_numba():
+    code = "import sys, backend.numerics, backend.numerics.reasons, backend.numerics.patterns; print('numba' in sys.modules)"
+    answer = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert answer.stdout.strip() == "False"
