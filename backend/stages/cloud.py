@@ -62,6 +62,8 @@ class Cloud:
     point_count: Annotated[int, Value("Points")]
     median_sigma_mm: Annotated[float, Value("Uncertainty, median", unit="mm")]
     kept_share: Annotated[float, Value("Decoded pixels that became points")]
+    cameras: tuple[str, ...] = ()
+    """The cameras that the points were made from, the reference first."""
 
 
 def enough_points(result: Cloud, params: Params) -> Check:

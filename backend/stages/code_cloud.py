@@ -262,4 +262,5 @@ def _cloud(codes: Codes, rig: _Pair, pixels: _PixelPoints, points: _Points) -> C
         point_count=int(order.size),
         median_sigma_mm=float(np.median(sigma_mm)) if order.size else float("nan"),
         kept_share=int(np.count_nonzero(pixels.valid)) / max(decoded, 1),
+        cameras=(rig.name,),
     )

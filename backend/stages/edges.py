@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, TypedDict
 
 import numpy as np
 from jaxtyping import Float32, Int32, UInt16
@@ -22,7 +22,6 @@ from backend.stages.code_frames import CodeFrames, CodeSet, code_sets
 
 _WEAK_SHARE = 0.4
 """A bit with less than this share of the best bit's contrast isn't resolved by the optics."""
-_ANY_CONTRAST = -1.0
 
 
 class EdgesParams(Params):
@@ -98,15 +97,13 @@ def edges(frames: CodeFrames, facts: RigFacts, params: EdgesParams, progress: Pr
 class _Decoded:
     """One camera along one direction."""
 
-    projector_px: Float32[np.ndarray, "h w"]
-    contrast_gray: UInt16[np.ndarray, "h w"]
-    reasons: UInt16[np.ndarray, "h w"]
+    gray: GrayCode
     weak_bits: int
     codes: int
 
 
 def _decode(code: CodeSet, projector: ProjectorFacts, params: EdgesParams) -> _Decoded:
-    """Read all bits for the position, and the certain ones alone for whether it counts."""
+    """Read all bits for the position, and judge the certain ones alone."""
     bits = len(code.patterns)
     if params.ignored_bits >= bits:
         raise StageFailedError(
@@ -116,49 +113,37 @@ def _decode(code: CodeSet, projector: ProjectorFacts, params: EdgesParams) -> _D
     if weak is None:
         weak = weak_bits(code, params.min_contrast_gray)
     weak = min(max(weak, params.ignored_bits), bits - 1)
-    read = _read(code, projector, params, params.ignored_bits, _ANY_CONTRAST)
-    certain = _read(code, projector, params, weak, params.min_contrast_gray)
-    reasons = read.reasons | certain.reasons
-    return _Decoded(
-        np.where(reasons == 0, read.projector_px, np.float32(np.nan)),
-        certain.contrast_gray,
-        reasons,
-        weak,
-        code.codes,
-    )
-
-
-def _read(
-    code: CodeSet,
-    projector: ProjectorFacts,
-    params: EdgesParams,
-    ignored_bits: int,
-    min_contrast_gray: float,
-) -> GrayCode:
     size_px = projector.width_px if code.axis == "x" else projector.height_px
-    saturation_gray = params.saturation_gray or code.full_scale_gray
+    read = _Reading(
+        codes=code.codes,
+        size_px=size_px,
+        min_contrast_gray=params.min_contrast_gray,
+        ignored_low_bits=params.ignored_bits,
+        unjudged_low_bits=weak - params.ignored_bits,
+        saturation_gray=params.saturation_gray or code.full_scale_gray,
+    )
+    return _Decoded(_read(code, read), weak, code.codes)
+
+
+class _Reading(TypedDict):
+    """How a code is read, whatever it is compared with."""
+
+    codes: int
+    size_px: int
+    min_contrast_gray: float
+    ignored_low_bits: int
+    unjudged_low_bits: int
+    saturation_gray: float
+
+
+def _read(code: CodeSet, reading: _Reading) -> GrayCode:
     patterns = [f.gray for f in code.patterns]
     if code.inverses:
-        return decode_gray_code(
-            patterns,
-            [f.gray for f in code.inverses],
-            codes=code.codes,
-            size_px=size_px,
-            min_contrast_gray=min_contrast_gray,
-            ignored_low_bits=ignored_bits,
-            saturation_gray=saturation_gray,
-        )
+        return decode_gray_code(patterns, [f.gray for f in code.inverses], **reading)
     assert code.white is not None, "a set without inverses has its fields"
     assert code.black is not None, "a set without inverses has its fields"
     return decode_gray_code_by_reference(
-        patterns,
-        white=code.white.gray,
-        black=code.black.gray,
-        codes=code.codes,
-        size_px=size_px,
-        min_contrast_gray=min_contrast_gray,
-        ignored_low_bits=ignored_bits,
-        saturation_gray=saturation_gray,
+        patterns, white=code.white.gray, black=code.black.gray, **reading
     )
 
 
@@ -190,7 +175,7 @@ def _thinned(frame: Frame) -> Int32[np.ndarray, "h w"]:
 def _summarise(decoded: dict[str, dict[str, _Decoded]], first: Mapping[str, CodeSet]) -> Codes:
     reasons = {name: _reasons(name, decoded) for name in first}
     columns, rows = (
-        {name: _where_valid(d, reasons[name]) for name, d in decoded[axis].items()}
+        {name: _where_valid(d.gray, reasons[name]) for name, d in decoded[axis].items()}
         for axis in ("x", "y")
     )
     both = [*decoded["x"].values(), *decoded["y"].values()]
@@ -208,17 +193,17 @@ def _summarise(decoded: dict[str, dict[str, _Decoded]], first: Mapping[str, Code
 
 
 def _reasons(name: str, decoded: dict[str, dict[str, _Decoded]]) -> UInt16[np.ndarray, "h w"]:
-    maps = [d[name].reasons for d in decoded.values() if name in d]
+    maps = [d[name].gray.reasons for d in decoded.values() if name in d]
     return np.asarray(np.bitwise_or.reduce(maps))
 
 
 def _contrast(name: str, decoded: dict[str, dict[str, _Decoded]]) -> UInt16[np.ndarray, "h w"]:
-    maps = [d[name].contrast_gray for d in decoded.values() if name in d]
+    maps = [d[name].gray.contrast_gray for d in decoded.values() if name in d]
     return np.asarray(np.minimum.reduce(maps))
 
 
 def _where_valid(
-    decoded: _Decoded, reasons: UInt16[np.ndarray, "h w"]
+    decoded: GrayCode, reasons: UInt16[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
     """Blank the pixels that the other direction can't read."""
     return np.where(reasons == 0, decoded.projector_px, np.float32(np.nan))
