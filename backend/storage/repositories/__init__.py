@@ -14,6 +14,7 @@ from backend.storage.repositories.frames import Frames
 from backend.storage.repositories.jobs import Jobs
 from backend.storage.repositories.runs import Decisions, Runs
 from backend.storage.repositories.scans import GivenResults, Scans
+from backend.storage.repositories.statistics import Statistics
 
 __all__ = ["Repositories"]
 
@@ -30,3 +31,4 @@ class Repositories:
         self.frames = Frames(session)
         self.jobs = Jobs(session, now)
         self.audit = AuditTrail(session, now)
+        self.statistics = Statistics(session)
