@@ -37,8 +37,8 @@ def encode(result: Any, store: ArtifactStore) -> Document:
     result
         An instance of a frozen dataclass whose fields are annotated with: numbers, texts, enumerations,
         None, numpy arrays (bare or with shapes), frames, pixels, pydantic models, named tuples, other
-        dataclasses, `tuple[...]`, `list[...]`, `Mapping[str, ...]`, `X | None`, `Annotated[...]`;
-        `Any` stands for JSON values.
+        dataclasses, `tuple[...]`, `list[...]`, `Mapping[str, ...]`, `X | None`, unions of models, of
+        arrays, or of numbers and texts, `Annotated[...]`; `Any` stands for JSON values.
     store
         Takes the arrays. A mapped array or a frame that is in it already isn't read again.
 
@@ -113,15 +113,13 @@ def _shape(annotation: Any) -> _Shape:
 
 
 def _shape_of_union(annotation: Any, members: tuple[Any, ...]) -> _Shape:
-    """One type or None, a union of models (told apart by their fields), or one of numbers and texts."""
-    others = tuple(m for m in members if m is not type(None))
-    if len(others) == 1:
-        return _Shape("optional", None, others)
-    kinds = {_shape(m).kind for m in others}
-    if kinds == {"model"} and len(others) == len(members):
-        return _Shape("model", annotation)
-    if kinds == {"model"}:
+    """One type or None, a union of models (told apart by their fields), of arrays, or of numbers and texts."""
+    others = tuple(member for member in members if member is not type(None))
+    if len(others) < len(members):
         return _Shape("optional", None, (typing.Union[others],))  # noqa: UP007 (made at run time)
+    kinds = {_shape(member).kind for member in members}
+    if kinds == {"model"}:
+        return _Shape("model", annotation)
     if kinds in ({"scalar"}, {"array"}):
         return _Shape(kinds.pop(), None)
     return _Shape("unknown", annotation)
@@ -168,6 +166,19 @@ def _fields(record: Any) -> dict[str, Any]:
     if not dataclasses.is_dataclass(record):
         return {name: hints[name] for name in record._fields}
     return {f.name: hints[f.name] for f in dataclasses.fields(record) if f.init}
+
+
+@lru_cache(maxsize=512)
+def _optional_fields(record: Any) -> set[str]:
+    """Return the names of the fields that have a default."""
+    if not dataclasses.is_dataclass(record):
+        return set(record._field_defaults)
+    missing = dataclasses.MISSING
+    return {
+        f.name
+        for f in dataclasses.fields(record)
+        if f.default is not missing or f.default_factory is not missing
+    }
 
 
 @lru_cache(maxsize=512)
@@ -329,41 +340,40 @@ class _Decoder:
     def _pixels(self, value: Any, shape: _Shape, path: str) -> StoredPixels:
         return _stored(self._store, value, path)
 
-    def _frame(self, value: Any, shape: _Shape, path: str) -> Frame:
+    def _frame(self, value: Any, shape: _Shape, path: str) -> Any:
         fields = dict(value["$frame"])
-        pixels = _stored(self._store, fields.pop("image"), f"{path}.pixels")
-        annotations = _fields(Frame)
-        known = {
-            name: self.decode(field, annotations[name], f"{path}.{name}")
-            for name, field in fields.items()
-            if name in annotations
-        }
-        return Frame(pixels=pixels, **known)
+        fields["pixels"] = fields.pop("image")
+        return self._record(fields, shape, path)
 
     def _record(self, value: Any, shape: _Shape, path: str) -> Any:
         if not isinstance(value, Mapping):
             raise _unfit(path, value)
-        arguments = {
+        annotations = _fields(shape.origin)
+        known = {
             name: self.decode(value[name], annotation, f"{path}.{name}")
-            for name, annotation in _fields(shape.origin).items()
+            for name, annotation in annotations.items()
             if name in value
         }
-        try:
-            return shape.origin(**arguments)
-        except TypeError as error:
+        if missing := sorted(set(annotations) - set(known) - _optional_fields(shape.origin)):
             raise CorruptDataError(
-                f"a stored result doesn't fit today's {shape.origin.__name__} ({error}); run its stage again"
-            ) from error
+                f"a stored result is damaged or of another version: {path} lacks {', '.join(missing)}; "
+                f"run its stage again"
+            )
+        return shape.origin(**known)
 
     def _mapping(self, value: Any, shape: _Shape, path: str) -> dict[str, Any]:
         kind = shape.arguments[1]
         return {k: self.decode(v, kind, f"{path}[{k!r}]") for k, v in value.items()}
 
     def _sequence(self, value: Any, shape: _Shape, path: str) -> Any:
+        if not isinstance(value, list):
+            raise _unfit(path, value)
         kind = shape.arguments[0]
         return shape.origin(self.decode(v, kind, f"{path}[{n}]") for n, v in enumerate(value))
 
     def _tuple(self, value: Any, shape: _Shape, path: str) -> tuple[Any, ...]:
+        if not isinstance(value, list) or len(value) != len(shape.arguments):
+            raise _unfit(path, value)
         pairs = zip(value, shape.arguments, strict=True)
         return tuple(self.decode(v, kind, f"{path}[{n}]") for n, (v, kind) in enumerate(pairs))
 
