@@ -2,7 +2,6 @@
 
 import logging
 import secrets
-from collections.abc import Mapping
 
 from starlette.datastructures import MutableHeaders
 from starlette.requests import ClientDisconnect
@@ -10,24 +9,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from backend.api import problems
 from backend.api.errors import TooLargeError
+from backend.api.headers import DEFAULTS
 from backend.contract.problems import Problem
 
 _log = logging.getLogger(__name__)
-
-DEFAULTS: Mapping[str, str] = {
-    "Cache-Control": "no-store",
-    "Content-Security-Policy": (
-        "default-src 'none'; img-src 'self' data:; style-src 'self'; script-src 'self'; "
-        "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-    ),
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Permissions-Policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=()",
-    "Referrer-Policy": "same-origin",  # not no-referrer: the login form's Origin would be null
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-}
-"""For answers that don't set them themselves."""
 
 _READING = frozenset({"GET", "HEAD", "OPTIONS", "DELETE"})
 

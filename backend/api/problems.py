@@ -12,6 +12,7 @@ from starlette.responses import HTMLResponse, Response
 
 from backend.api.assets import filled
 from backend.api.errors import NotLoggedInError, TooManyAttemptsError
+from backend.api.headers import FRAMED_BY_US
 from backend.contract.problems import Problem
 from backend.domain.errors import UnglareError
 
@@ -61,13 +62,14 @@ async def _expected(request: Request, error: Exception) -> Response:
     return _fitting(request, problem_of(error), _headers(error))
 
 
-def _fitting(request: Request, problem: Problem, headers: Mapping[str, str] | None) -> Response:
+def _fitting(
+    request: Request, problem: Problem, headers: Mapping[str, str] | None = None
+) -> Response:
     """Answer a person in front of a browser with a page, everybody else with JSON."""
-    for_people = "text/html" in request.headers.get("accept", "")
-    if not for_people or request.url.path.startswith("/api/"):
+    if "text/html" not in request.headers.get("accept", ""):
         return answer(problem, headers)
     page = filled("error.html", title=problem.title, sentence=problem.detail)
-    return HTMLResponse(page, problem.status, dict(headers or {}))
+    return HTMLResponse(page, problem.status, {**FRAMED_BY_US, **(headers or {})})
 
 
 def _headers(error: UnglareError) -> dict[str, str]:
@@ -78,7 +80,7 @@ def _headers(error: UnglareError) -> dict[str, str]:
     return {}
 
 
-async def _invalid_request(_request: Request, error: Exception) -> Response:
+async def _invalid_request(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     findings = error.errors()
     more = f" ({len(findings) - 1} more)" if len(findings) > 1 else ""
@@ -89,7 +91,7 @@ async def _invalid_request(_request: Request, error: Exception) -> Response:
         detail=f"{_finding(findings[0])}{more}.",
         details={"errors": [_finding(finding) for finding in findings[:20]]},
     )
-    return answer(problem)
+    return _fitting(request, problem)
 
 
 def _finding(finding: Mapping[str, Any]) -> str:
