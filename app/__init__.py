@@ -1,0 +1,1 @@
+"""The operators' user interface: a client of the API and nothing else."""

@@ -1,0 +1,634 @@
+"""What one browser looks at, and what has to be redrawn when something changes.
+
+Three threads work for a browser. *Acts* owns the state: it calls the API for whatever the operator does and draws
+what follows from the answer. *Loads* fetches arrays, pictures and clouds. *Events* listens to the server. viser's own
+threads only put work into the queues, so they never wait.
+"""
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import httpx
+import viser
+
+from app import markup, theme
+from app.clicks import Clicks
+from app.client import ApiClient, ApiError
+from app.look import Look
+from app.panels.audit import AuditPanel
+from app.panels.cloud import CloudPanel
+from app.panels.decision import buttons
+from app.panels.dialogs import ask_export, ask_part_moved
+from app.panels.inspect import Inspector, decoded, decoded_url, pixel_of
+from app.panels.new_scan import NewScanPanel
+from app.panels.pictures import PicturesPanel, is_live
+from app.panels.review import ReviewPanel
+from app.panels.rig import RigPanel
+from app.panels.scan_list import ScanListPanel
+from app.panels.settings import SettingsPanel
+from app.panels.stage import StagePanel
+from app.space import Space
+from app.station import Introduction
+from app.views.mask import crisp
+from app.worker import Work, Worker
+from backend.contract.descriptions import MethodDescription
+from backend.contract.events import Event, FrameCaptured, JobProgress, RigChanged, ScanChanged
+from backend.contract.requests import (
+    CreateScan,
+    Decide,
+    EditSettings,
+    ExportScan,
+    ImportCapture,
+    RedoStage,
+    StartRun,
+    UndoEdit,
+)
+from backend.contract.scans import ScanState
+
+_LOG = logging.getLogger(__name__)
+_WIDE_PX = 1500
+"""A canvas at least so wide on arrival gets wide panels."""
+_LARGE_PX = 2000
+_NOTE_S = 8.0
+
+
+class Session:
+    """One connected browser.
+
+    Parameters
+    ----------
+    client
+        viser's handle of the browser.
+    api
+        Calls the API on behalf of the user who sits there.
+    who
+        That user.
+    points_budget
+        Most points of a cloud that are shown before the operator asks for more.
+    """
+
+    def __init__(
+        self, client: viser.ClientHandle, api: ApiClient, who: Introduction, *, points_budget: int
+    ) -> None:
+        self.api, self.who = api, who
+        self._client, self._gui = client, client.gui
+        self._points_budget = points_budget
+        self._look: Look | None = None
+        self._methods: dict[str, MethodDescription] = {}
+        self._draft_errors: dict[str, str] = {}
+        self._reason = ""
+        self._stopping = threading.Event()
+        self._acts = Worker(f"acts {client.client_id}", self._report)
+        self._loads = Worker(f"loads {client.client_id}", self._report)
+        self._events = threading.Thread(
+            target=self._listen, name=f"events {client.client_id}", daemon=True
+        )
+        self._acts.submit(self._build)
+
+    def close(self) -> None:
+        """End the session's threads; the browser is gone."""
+        self._stopping.set()
+        self._acts.close()
+        self._loads.close()
+        self.api.close()
+
+    # ---- what panels ask for (see app/desk.py)
+
+    @property
+    def look(self) -> Look | None:
+        """What is looked at just now; None on the start page."""
+        return self._look
+
+    def act(self, work: Work, *, key: str | None = None) -> None:
+        """Do something short, on the thread that owns the state."""
+        self._acts.submit(work, key=key)
+
+    def load(self, work: Work, *, key: str | None = None) -> None:
+        """Fetch something long, on another thread."""
+        self._loads.submit(work, key=key)
+
+    def notify(self, title: str, body: str, *, colour: str = "blue") -> None:
+        """Show a note that goes away by itself."""
+        self._client.add_notification(title, body, auto_close_seconds=_NOTE_S, color=colour)  # type: ignore[call-overload]
+
+    def open_scan(self, scan_id: str) -> None:
+        """Show a scan."""
+        self.act(lambda: self._open(self.api.scan(scan_id)))
+
+    def go_home(self) -> None:
+        """Show the list of scans."""
+        self.act(self._go_home)
+
+    def select(self, stage: str | None) -> None:
+        """Look at a stage; None follows what happens."""
+        self.act(lambda: self._change(lambda look: _pinned(look, stage)))
+
+    def set_draft(self, name: str, value: Any) -> None:
+        """Note an edit of the stage on the screen, not applied yet."""
+        self.act(lambda: self._set_draft(name, value), key=f"draft {name}")
+
+    def set_draft_error(self, name: str, error: str | None) -> None:
+        """Note that what was typed for a setting can't be read."""
+        others = {k: v for k, v in self._draft_errors.items() if k != name}
+        self._draft_errors = others | ({name: error} if error else {})
+        self.act(self._draw_controls, key="controls")
+
+    def set_reason(self, reason: str) -> None:
+        """Keep the words that go into the log with the next edit or decision."""
+        self._reason = reason
+
+    def do_primary(self) -> None:
+        """Do what the large button says."""
+        self.act(self._do_primary)
+
+    def apply(self) -> None:
+        """Apply the edits of the stage on the screen and run it."""
+        self.act(self._apply)
+
+    def reset(self, name: str) -> None:
+        """Put a setting back and run the stage."""
+        self.act(lambda: self._edit({}, (name,)))
+
+    def redo(self) -> None:
+        """Take the pictures of the stage on the screen again."""
+        self.act(self._redo)
+
+    def stop(self) -> None:
+        """Cancel the running job, or reject the result on the screen."""
+        self.act(self._stop)
+
+    def undo(self) -> None:
+        """Take back the last edit."""
+        self.act(self._undo)
+
+    def part_moved(self) -> None:
+        """Ask whether to take all pictures again."""
+        self.act(
+            lambda: ask_part_moved(
+                self._gui, lambda reason: self.act(lambda: self._redo_all(reason))
+            )
+        )
+
+    def export(self) -> None:
+        """Ask where to write the results."""
+        self.act(self._ask_export)
+
+    def create(self, request: CreateScan, *, run: bool) -> None:
+        """Make a scan, open it, and run it if asked to."""
+        self.act(lambda: self._create(request, run=run))
+
+    def import_capture(self, request: ImportCapture) -> None:
+        """Import a captured folder and open the scan."""
+        self.act(lambda: self._open(self.api.import_capture(request)))
+
+    def show_rig(self) -> None:
+        """Show the rig that is chosen on the start page."""
+        self.load(self._show_rig, key="rig")
+
+    def inspect(self, camera: str) -> None:
+        """Show a camera's picture large."""
+        self.load(lambda: self._inspect(camera), key="inspect")
+
+    def leave_inspection(self) -> None:
+        """Show the scene again."""
+        self.load(self._leave_inspection, key="inspect")
+
+    # ---- building
+
+    def _build(self) -> None:
+        gui, client = self._gui, self._client
+        wide = client.camera.image_width > _WIDE_PX
+        gui.set_panel_label(f"unglare · {self.who.user}" if self.who.user else "unglare")
+        self._style = gui.add_html(theme.STYLE, order=1e7)
+        self.clicks = Clicks(gui)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(440 if wide else 384)
+        self._home = gui.add_folder(None, order=1, visible=False)
+        self._scan = gui.add_folder(None, order=2, visible=False)
+        self._list_panel = gui.add_panel()
+        self._list_panel.dock_left()
+        self._list_panel.set_width(400 if wide else 300)
+        with self._list_panel.add_tab("Scans", viser.Icon.LIST_DETAILS):
+            self._scans = ScanListPanel(gui, self)
+        self._build_scan_panels(wide=wide)
+        self._space = Space(client)
+        self._rig = RigPanel(self._space, self)
+        self._cloud = CloudPanel(client, self._space, self, budget=self._points_budget)
+        self._inspector = Inspector(client, self._space, self)
+        self._new_scan: NewScanPanel | None = None
+        with self._home:
+            if self.who.may_operate:
+                self._new_scan = NewScanPanel(gui, self)
+            else:
+                gui.add_html(
+                    markup.div(
+                        "ug-empty", "You watch. As soon as a scan is worked on, it appears here."
+                    )
+                )
+        if self.who.may_operate:
+            self._add_commands()
+            self._listen_to_clicks()
+        self._methods = {m.name: m for m in self.api.methods()}
+        self._scans.name_methods({m.name: m.title for m in self._methods.values()})
+        self._go_home()
+        self._events.start()
+
+    def _build_scan_panels(self, *, wide: bool) -> None:
+        gui = self._gui
+        self._scan_panel = gui.add_panel(visible=False)
+        self._scan_panel.dock_left()
+        self._scan_panel.set_width(400 if wide else 268)
+        with self._scan_panel.add_tab("Pictures", viser.Icon.PHOTO):
+            self._pictures = PicturesPanel(gui, self)
+        with self._scan_panel.add_tab("Log", viser.Icon.HISTORY):
+            self._audit = AuditPanel(gui)
+        with self._scan:
+            self._stage = StagePanel(gui, self)
+            self._review = ReviewPanel(gui, self)
+            self._settings = SettingsPanel(gui, self) if self.who.may_operate else None
+
+    def _add_commands(self) -> None:
+        keys: list[tuple[str, str, str | None, Callable[[], None]]] = [
+            ("Accept, run, or whatever the large button says", "F", None, self.do_primary),
+            ("Apply changed settings", "O", None, self.apply),
+            ("Take the pictures of this stage again", "R", None, self.redo),
+            ("Undo the last edit", "Z", "cmd/ctrl", self.undo),
+            ("Close the enlarged picture", "X", None, self.leave_inspection),
+            ("Follow the running stage", "G", None, lambda: self.select(None)),
+            ("All scans", "H", None, self.go_home),
+        ]
+        for label, key, modifier, work in keys:
+            command = self._gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]
+            _on_trigger(command, work)
+
+    def _listen_to_clicks(self) -> None:
+        @self._client.scene.on_click()
+        def _(event: viser.SceneClickEvent) -> None:
+            origin, direction = event.ray_origin, event.ray_direction
+            self.load(lambda: self._clicked(origin, direction), key="click")
+
+    # ---- pages
+
+    def _go_home(self) -> None:
+        self._look = None
+        if self.who.may_operate is False and self._follow_newest():
+            return
+        with self._client.atomic():
+            self._scan.visible = self._scan_panel.visible = False
+            self._home.visible = self._list_panel.visible = True
+        self._scans.refresh()
+        self.load(self._clear_scene)
+        if self._new_scan is not None:
+            self._new_scan.fill(tuple(self._methods.values()), self.api.rigs())
+            self.show_rig()
+
+    def _clear_scene(self) -> None:
+        self._inspector.close()
+        self._cloud.forget()
+        self._rig.show(None, "")
+
+    def _follow_newest(self) -> bool:
+        """Show a viewer the newest scan: a viewer has no controls to choose one."""
+        newest = self.api.scans(limit=1)
+        if newest:
+            self._open(self.api.scan(newest[0].id))
+        return bool(newest)
+
+    def _open(self, scan: ScanState) -> None:
+        is_other = self._look is None or self._look.scan.id != scan.id
+        method = self._methods.get(scan.method)
+        if is_other:
+            self.load(self._clear_scene)
+        self._look = Look(scan, method, may_operate=self.who.may_operate)
+        self._draw()
+        with self._client.atomic():
+            self._home.visible = self._list_panel.visible = False
+            self._scan.visible = self._scan_panel.visible = True
+
+    def _create(self, request: CreateScan, *, run: bool) -> None:
+        scan = self.api.create(request)
+        self._open(scan)
+        if run:
+            self._take(self.api.run(scan.id, StartRun()))
+
+    # ---- changes
+
+    def _change(self, change: Callable[[Look], Look]) -> None:
+        if self._look is not None:
+            self._look = change(self._look)
+            self._draw()
+
+    def _take(self, scan: ScanState, *, follow: bool = False) -> None:
+        """Draw a newer state of the scan on the screen."""
+        look = self._look
+        if look is None or look.scan.id != scan.id:
+            return
+        look = look.with_scan(scan)
+        self._look = _pinned(look, None) if follow else look
+        self._draw()
+
+    def _do_primary(self) -> None:
+        look = self._look
+        if look is None or not look.may_operate:
+            return
+        primary = buttons(look).primary
+        if primary.do == "accept" and look.stage.stage_run:
+            request = _decision("accept", self._take_reason(), proceed=True)
+            self._take(self.api.decide(look.stage.stage_run, request), follow=True)
+        elif primary.do == "run":
+            self._take(self.api.run(look.scan.id, StartRun()), follow=True)
+        elif primary.do == "select":
+            self._change(lambda old: _pinned(old, primary.stage))
+        elif primary.do == "follow":
+            self._change(lambda old: _pinned(old, None))
+        elif primary.do == "export":
+            self._ask_export()
+
+    def _set_draft(self, name: str, value: Any) -> None:
+        if self._look is not None and self._look.may_operate:
+            self._look = self._look.with_draft(name, value)
+            self._draw_controls()
+            look = self._look
+            self.load(lambda: self._review.show_draft(look), key="draft")
+
+    def _apply(self) -> None:
+        look = self._look
+        if look is None:
+            return
+        if self._draft_errors:
+            name, error = next(iter(self._draft_errors.items()))
+            self.notify(name, f"{error}.", colour="red")
+        elif look.draft and look.may_operate:
+            self._edit(dict(look.draft), ())
+
+    def _edit(self, changes: dict[str, Any], reset: tuple[str, ...]) -> None:
+        look = self._look
+        if look is None or not look.may_operate:
+            return
+        stage, was_run = look.stage.name, look.stage.status != "pending"
+        request = EditSettings(
+            changes=changes, reset=reset, reason=self._take_reason(), revision=look.scan.revision
+        )
+        try:
+            scan = self.api.edit(look.scan.id, stage, request)
+        except ApiError as error:
+            if error.problem.type.endswith("stale-edit"):
+                self._show_stale(error, look)
+                return
+            raise
+        self._look = _pinned(look.without_drafts(stage), stage)
+        if was_run and not look.running:
+            scan = self.api.run(scan.id, StartRun(until=stage))
+        self._take(scan)
+
+    def _show_stale(self, error: ApiError, look: Look) -> None:
+        """Show the other operator's edit in place of ours, in the words of the server."""
+        self.notify("Somebody else was faster", error.problem.detail, colour="orange")
+        self._look = look.without_drafts(look.stage.name)
+        self._take(self.api.scan(look.scan.id))
+
+    def _redo(self) -> None:
+        look = self._look
+        if look is None or not buttons(look).redo.enabled:
+            return
+        stage = look.stage.name
+        request = RedoStage(reason=self._take_reason(), revision=look.scan.revision)
+        scan = self.api.redo(look.scan.id, stage, request)
+        self._look = _pinned(look, stage)
+        self._take(self.api.run(scan.id, StartRun(until=stage)))
+
+    def _redo_all(self, reason: str) -> None:
+        look = self._look
+        if look is None:
+            return
+        capturing = (
+            next((s.name for s in look.method.stages if s.captures), look.stage.name)
+            if look.method
+            else look.stage.name
+        )
+        request = RedoStage(all=True, reason=reason, revision=look.scan.revision)
+        scan = self.api.redo(look.scan.id, capturing, request)
+        self._take(self.api.run(scan.id, StartRun()), follow=True)
+
+    def _stop(self) -> None:
+        look = self._look
+        if look is None:
+            return
+        if look.running:
+            self._take(self.api.cancel(look.scan.id))
+        elif look.stage.stage_run:
+            request = _decision("reject", self._take_reason(), proceed=False)
+            self._take(self.api.decide(look.stage.stage_run, request))
+
+    def _undo(self) -> None:
+        look = self._look
+        if look is not None and look.scan.undo and look.may_operate:
+            self._take(self.api.undo(look.scan.id, UndoEdit(revision=look.scan.revision)))
+
+    def _ask_export(self) -> None:
+        look = self._look
+        if look is not None:
+            scan_id = look.scan.id
+            ask_export(
+                self._gui,
+                self,
+                scan_id,
+                lambda folder, frames: self.act(
+                    lambda: self._export(scan_id, folder, frames=frames)
+                ),
+            )
+
+    def _export(self, scan_id: str, folder: str, *, frames: bool) -> None:
+        written = self.api.export(scan_id, ExportScan(folder=folder, frames=frames))
+        self.notify(
+            "Exported",
+            f"{len(written)} files in {folder}" if written else f"Written to {folder}",
+            colour="green",
+        )
+
+    def _take_reason(self) -> str:
+        reason, self._reason = self._reason.strip(), ""
+        return reason
+
+    # ---- drawing
+
+    def _draw(self) -> None:
+        look = self._look
+        if look is None:
+            return
+        self._stage.draw(look)
+        if self._settings is not None:
+            self._settings.draw(look)
+        self.load(lambda: self._draw_loaded(look), key="draw")
+        self.load(lambda: self._audit.draw(look.scan, self.api.audit(look.scan.id)), key="audit")
+
+    def _draw_controls(self) -> None:
+        look = self._look
+        if look is not None:
+            self._stage.draw(look)
+            if self._settings is not None:
+                self._settings.draw(look)
+
+    def _draw_loaded(self, look: Look) -> None:
+        if self._look is None or self._look.scan.id != look.scan.id:
+            return
+        self._review.draw(look)
+        self._pictures.draw(look)
+        self._rig.draw(look)
+        self._cloud.draw(look)
+        if is_live(look) and self._rig.rig is not None:
+            for camera in self._rig.rig.cameras:
+                self._show_live(look.scan.rig, camera.name)
+        if self._inspector.is_open:
+            self._cloud.set_panel_visible(False)
+            self._refresh_inspection(look)
+
+    def _show_rig(self) -> None:
+        chosen = self._new_scan.chosen_rig() if self._new_scan is not None else None
+        if self._look is not None or chosen is None:
+            return
+        name, options = chosen
+        with contextlib.suppress(
+            ApiError
+        ):  # half-typed options: the forms say what is wrong when it counts
+            self._rig.show(self.api.rig(name, options), f"rig {name} {options}")
+
+    def _inspect(self, camera: str) -> None:
+        look = self._look
+        if look is None:
+            return
+        title, figures = self._pictures.figures()
+        figure = next((f for f in figures if f.camera == camera), None)
+        if figure is not None:
+            self._cloud.set_panel_visible(False)
+            self._inspector.show(title, figure, self._picture_of(figure.source), look)
+
+    def _refresh_inspection(self, look: Look) -> None:
+        shown = self._inspector.figure
+        camera = shown.camera if shown else None
+        title, figures = self._pictures.figures()
+        figure = next((f for f in figures if f.camera == camera), None)
+        if figure is None:
+            self._leave_inspection()
+        elif figure != self._inspector.figure:
+            self._inspector.show(title, figure, self._picture_of(figure.source), look)
+
+    def _picture_of(self, source: str) -> Any:
+        is_inside = source.startswith("data:")
+        picture = decoded_url(source) if is_inside else decoded(self.api.picture(source))
+        return crisp(picture, _LARGE_PX)
+
+    def _leave_inspection(self) -> None:
+        self._inspector.close()
+        self._cloud.set_panel_visible(True)
+
+    def _clicked(self, origin: Any, direction: Any) -> None:
+        look = self._look
+        if look is None:
+            return
+        if self._inspector.is_open:
+            self._inspector.click(look, origin, direction)
+            return
+        picked = self._cloud.pick(origin, direction)
+        if picked is not None:
+            pixel = pixel_of(self._rig.rig, picked.point_mm) if self._rig.rig else None
+            self._inspector.show_point(look, picked.facts, pixel)
+
+    # ---- events
+
+    def _listen(self) -> None:
+        try:
+            for event in self.api.events(self._stopping):
+                if self._stopping.is_set():
+                    return
+                self._hear(event)
+        except ApiError as error:
+            self._report(error)
+
+    def _hear(self, event: Event | None) -> None:
+        look = self._look
+        if event is None or isinstance(event, ScanChanged):
+            self.act(
+                lambda: self._scan_changed(event.scan if event else None),
+                key=f"changed {event.scan if event else ''}",
+            )
+        elif isinstance(event, JobProgress):
+            if look is not None and event.scan == look.scan.id:
+                self.act(lambda: self._progressed(event), key="progress")
+        elif isinstance(event, FrameCaptured):
+            if look is not None and event.scan == look.scan.id:
+                self.load(
+                    lambda: self._show_live(event.rig, event.camera), key=f"live {event.camera}"
+                )
+        elif isinstance(event, RigChanged) and look is None:
+            self.show_rig()
+
+    def _scan_changed(self, scan_id: str | None) -> None:
+        look = self._look
+        if look is None:
+            self._scans.refresh()
+            if not self.who.may_operate:
+                self._go_home()
+        elif scan_id in (None, look.scan.id):
+            self._take(self.api.scan(look.scan.id))
+        elif not self.who.may_operate:
+            self._open(self.api.scan(str(scan_id)))
+
+    def _progressed(self, event: JobProgress) -> None:
+        look = self._look
+        if look is None or event.scan != look.scan.id:
+            return
+        is_other_stage = look.scan.job is None or look.scan.job.stage != event.job.stage
+        if is_other_stage or look.scan.job is None or look.scan.job.status != event.job.status:
+            self._take(self.api.scan(look.scan.id))
+            return
+        self._look = look.with_scan(look.scan.model_copy(update={"job": event.job}))
+        self._stage.progress(self._look)
+
+    def _show_live(self, rig: str, camera: str) -> None:
+        """Show the newest picture of a camera in its frustum and, while a stage captures, in the panel."""
+        look = self._look
+        jpeg = self.api.camera_picture(rig, camera) if look is not None else None
+        if look is None or jpeg is None or look.scan.rig != rig:
+            return
+        self._rig.show_live(camera, jpeg)
+        if is_live(look):
+            self._pictures.show_live(camera, jpeg, order=self._rig.order_of(camera))
+
+    # ---- errors
+
+    def _report(self, error: Exception) -> None:
+        if self._stopping.is_set():
+            return
+        if isinstance(error, ApiError):
+            self.notify("Not done", error.problem.detail, colour="red")
+        elif isinstance(error, httpx.HTTPError):
+            self.notify(
+                "No answer", "The server doesn't answer; trying again when it does.", colour="red"
+            )
+        else:
+            _LOG.error("defect in the user interface", exc_info=error)
+            self.notify(
+                "Defect",
+                f"The user interface failed: {error}. See the station's log.",
+                colour="red",
+            )
+
+
+def _pinned(look: Look, stage: str | None) -> Look:
+    """Look at a stage; the active one is followed, not pinned."""
+    return replace(look, pinned=None if stage == look.active.name else stage)
+
+
+def _decision(verdict: str, reason: str, *, proceed: bool) -> Decide:
+    return Decide.model_validate({"verdict": verdict, "reason": reason, "proceed": proceed})
+
+
+def _on_trigger(command: viser.CommandHandle, work: Callable[[], None]) -> None:
+    @command.on_trigger
+    async def _(_: Any) -> None:
+        work()
