@@ -48,8 +48,9 @@ class ServiceLimits(NamedTuple):
     """Smallest usable amplitude B of the fringes."""
     phase_sigma_max_rad: float = 0.0538
     """Noisier pixels count as not covered: one wrong fringe order in a million (59, 64, 70)."""
-    penalty_rad2: float = float(np.pi**2 / 3)
-    """Cost of a pixel without phase: the variance of a phase that is anything."""
+    noise_weight: float = 0.1
+    """Cost of a pixel whose phase is as noisy as just allowed, against 1 for a pixel without a phase:
+    one more pixel counts ten times as much as making another one precise."""
 
 
 class ExposureGrid(NamedTuple):
@@ -84,8 +85,9 @@ class Prediction(NamedTuple):
     """Share of the pixels that saturate even at the shortest exposure."""
     phase_sigma_median_rad: float
     """Median over the covered pixels; NaN without any."""
-    cost_rad2: float
-    """Mean predicted phase variance over all pixels, with the penalty for those without phase."""
+    cost: float
+    """What the plan minimises, 0..1: the share of the pixels without a usable phase, plus the noise
+    of the others, weighted (see `ServiceLimits.noise_weight`)."""
     phase_sigma_rad: Float[np.ndarray, "bin"]
     """Predicted noise per light level; NaN where no exposure serves it."""
     served_by: Integer[np.ndarray, "bin"]
@@ -396,7 +398,7 @@ def predict(
         coverage=float(light.pixels[covered].sum() / total),
         saturated=float(light.pixels[too_bright].sum() / total),
         phase_sigma_median_rad=_weighted_median(sigma[covered], light.pixels[covered]),
-        cost_rad2=float((_cost(combined, coding, limits) * light.pixels).sum() / total),
+        cost=float((_cost(combined, coding, limits) * light.pixels).sum() / total),
         phase_sigma_rad=sigma,
         served_by=np.where(combined > 0, times.size - 1 - longest_first, -1),
     )
@@ -409,14 +411,20 @@ def _combined(
     return np.asarray(information.sum(axis=0) if fusion == "weighted" else information.max(axis=0))
 
 
+_WRONG_ORDERS_ALLOWED = 0.01
+"""A pixel with this probability of a wrong fringe order is worth nothing."""
+
+
 def _cost(
     information: Float[np.ndarray, "*any"], coding: FringeCoding, limits: ServiceLimits
 ) -> Float[np.ndarray, "*any"]:
-    """Return the expected squared phase error: noise, plus the penalty for no phase or a wrong fringe order."""
+    """Return 1 for no phase or one whose order can't be trusted, else the weighted phase variance."""
     sigma = 1 / np.sqrt(np.maximum(information, 1e-12))
-    wrong_order = np.minimum(2.4 * ndtr(-coding.order_distance_rad / sigma), 1.0)
-    expected = sigma**2 + wrong_order * limits.penalty_rad2
-    return np.where(information > 0, np.minimum(expected, limits.penalty_rad2), limits.penalty_rad2)
+    wrong_order = 2.4 * ndtr(-coding.order_distance_rad / sigma)
+    noise = limits.noise_weight * (sigma / limits.phase_sigma_max_rad) ** 2
+    return np.where(
+        information > 0, np.minimum(noise + wrong_order / _WRONG_ORDERS_ALLOWED, 1.0), 1.0
+    )
 
 
 def _weighted_median(values: Float[np.ndarray, "n"], weights: Float[np.ndarray, "n"]) -> float:
@@ -464,7 +472,7 @@ def plan_exposures(
     fusion: FusionKind = "weighted",
     gain_min: float = 0.25,
 ) -> ExposurePlan:
-    r"""Choose the exposures with the least mean phase variance within a time budget.
+    r"""Choose the exposures that measure most pixels, with least noise, within a time budget.
 
     Parameters
     ----------
@@ -527,8 +535,9 @@ def plan_exposures(
                 overhead_ms=grid.overhead_ms,
             )
         )
-    cost = np.array([p.cost_rad2 for p in best])
-    gain = np.concatenate([[np.nan], 1 - cost[1:] / cost[:-1]])
+    # what no exposure can serve (shadows, mirrors) mustn't hide what a further exposure gains elsewhere
+    cost = np.array([p.cost for p in best]) - _unservable(problem)
+    gain = np.concatenate([[np.nan], 1 - cost[1:] / np.maximum(cost[:-1], 1e-12)])
     return ExposurePlan(best[_enough(cost, gain_min)], tuple(best), gain)
 
 
@@ -592,6 +601,12 @@ def _check_budget(problem: _Problem, budget_s: float, least: int) -> None:
         )
 
 
+def _unservable(problem: _Problem) -> float:
+    """Return the share of the pixels that no possible exposure serves."""
+    served = (problem.information > 0).any(axis=0)
+    return float(problem.pixels[~served].sum() / max(problem.pixels.sum(), 1.0))
+
+
 def _enough(cost: Float[np.ndarray, "count"], gain_min: float) -> int:
     """Return the index of the last number of exposures that is worth its step."""
     if gain_min <= 0:
@@ -643,7 +658,7 @@ def _interval_costs(problem: _Problem) -> Float[np.ndarray, "candidate_1 candida
     costs[-1, :] = 0.0
     for i in range(number):
         # served by the longer one: it takes over from whatever served before, i or shorter
-        gain = np.where(served[i], weighted[i], problem.limits.penalty_rad2 * problem.pixels)
+        gain = np.where(served[i], weighted[i], problem.pixels)
         change = np.where(served[i + 1 :], weighted[i + 1 :] - gain, 0.0)
         costs[i + 1, i + 1 : number] = change.sum(axis=1)
     return costs

@@ -37,7 +37,7 @@ BUDGET_S: dict[Budget, float] = {"fast": 6.0, "balanced": 20.0, "thorough": 60.0
 """Light time of all fringes that each budget allows."""
 
 WORTHWHILE_GAIN = 0.1
-"""One exposure more is planned as long as it lowers the mean phase variance by this share."""
+"""One exposure more is planned as long as it lowers the plan's cost (unmeasured pixels and noise) by this share."""
 
 
 class ExposuresParams(Params):

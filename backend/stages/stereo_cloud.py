@@ -16,6 +16,7 @@ from backend.domain.states import Review
 from backend.numerics import filters
 from backend.numerics.camera_model import Pinhole, RigidTransform
 from backend.numerics.confirmation import confirmed
+from backend.numerics.drift import smooth_drift
 from backend.numerics.filters import Kept
 from backend.numerics.matching import MatchSettings, match
 from backend.numerics.normals import normals
@@ -58,10 +59,11 @@ class StereoCloudParams(Params):
     settle_by_projector: bool = setting(True, title="Settle doubts by the projector")
     """Where the match is ambiguous and the projector is calibrated, take the place that all three agree on."""
     consistency_px: float | None = setting(
-        1.0, title="Contradiction with the projector", unit="px", gt=0, le=100
+        0.15, title="Contradiction with the projector", unit="px", gt=0, le=100
     )
-    """Points whose place in the calibrated projector differs by more from the measured coordinate
-    (beyond 5 sigma) are second reflections; empty switches the check off."""
+    """Points whose place in the calibrated projector differs by more than this beyond 5 sigma from the measured
+    coordinate are second reflections or mixed pixels. A smooth drift of the projector's calibration is taken off
+    first. Empty switches the check off."""
     outlier_sigmas: float = setting(6.0, title="Outliers beyond", unit="sigma", ge=0, le=100)
     """Points so far from the median of their 5x5 neighbourhood, and alone there, are removed; 0 = off."""
     speck_px: int = setting(12, title="Smallest patch", unit="px", ge=0, le=100_000)
@@ -288,6 +290,7 @@ class _Scene:
         contradiction = projector_consistency(
             raw.points_mm, maps[self.name], self.projector, self.projector_from_camera, rows=rows
         )
+        contradiction -= smooth_drift(contradiction)
         beyond_noise = np.abs(contradiction) - np.float32(5.0) * np.nan_to_num(sigma)
         return filters.within_limits(
             raw.points_mm, beyond_noise, highest=self.params.consistency_px
@@ -327,4 +330,5 @@ class _Scene:
             point_count=int(np.count_nonzero(valid)),
             median_sigma_mm=float(np.median(sigma)),
             kept_share=int(np.count_nonzero(valid)) / max(decoded, 1),
+            cameras=(self.name,) if self.other is None else (self.name, self.other),
         )

@@ -22,7 +22,9 @@ from backend.numerics.planning import (
     single_exposures,
 )
 
-NOISE = CameraNoise(full_scale_gray=255, black_gray=4, read_noise_gray=12 / 60, full_well_e=60 * 255)
+NOISE = CameraNoise(
+    full_scale_gray=255, black_gray=4, read_noise_gray=12 / 60, full_well_e=60 * 255
+)
 FREE = ExposureGrid(0.05, 2000.0)
 DLP = ExposureGrid(0.05, 2000.0, period_ms=1000 / 120)
 
@@ -55,7 +57,9 @@ def test_black_level_is_taken_off_both_gray_levels():
     assert exposure_for_peak(10, np.array([54.0]), 254, black_gray=4) == pytest.approx([50])
 
 
-@pytest.mark.parametrize(("t_pre", "peak", "message"), [(0, 50, "pre-exposure is 0"), (9, 3, "not above the black")])
+@pytest.mark.parametrize(
+    ("t_pre", "peak", "message"), [(0, 50, "pre-exposure is 0"), (9, 3, "not above the black")]
+)
 def test_peak_rule_refuses(t_pre, peak, message):
     with pytest.raises(PlanningError, match=message):
         exposure_for_peak(t_pre, np.array([float(peak)]), 254, black_gray=4)
@@ -141,9 +145,9 @@ def test_plan_is_the_best_of_all_sets(fusion, count, budget_s):
     frames = int(budget_s * 1000 / 12 / grid.period_ms)
     times = grid.period_ms * np.arange(1, min(frames, 22) + 1)
     sets = [s for s in combinations(times, count) if sum(s) * 12 <= budget_s * 1000]
-    best = min(predict(SCENE, np.array(s), NOISE, fusion=fusion).cost_rad2 for s in sets)
+    best = min(predict(SCENE, np.array(s), NOISE, fusion=fusion).cost for s in sets)
     assert plan.chosen.time_s <= budget_s * (1 + 1e-9)
-    assert plan.chosen.cost_rad2 <= best * 1.001
+    assert plan.chosen.cost <= best * 1.001
 
 
 @pytest.mark.parametrize("grid", [FREE, DLP], ids=["free", "frames"])
@@ -157,11 +161,13 @@ def test_about_three_exposures_cover_a_high_contrast_scene(grid):
 
 def test_more_time_never_hurts_and_a_step_lowers_the_cost_by_its_gain():
     plans = [plan_exposures(SCENE, NOISE, DLP, budget_s=b, count_range=(3, 3)) for b in (2, 5, 15)]
-    costs = [p.chosen.cost_rad2 for p in plans]
+    costs = [p.chosen.cost for p in plans]
     assert costs == sorted(costs, reverse=True)
     plan = plan_exposures(SCENE, NOISE, DLP, budget_s=10.0)
     assert np.isnan(plan.gain[0])
-    assert plan.gain[1] == pytest.approx(1 - plan.by_count[1].cost_rad2 / plan.by_count[0].cost_rad2)
+    assert plan.gain[1] == pytest.approx(
+        1 - plan.by_count[1].cost / plan.by_count[0].cost
+    )
 
 
 @given(budget_s=st.floats(0.5, 60), seed=st.integers(0, 50), most=st.integers(1, 4))
@@ -201,5 +207,6 @@ def test_low_and_high_single_exposures_bracket_the_planned_ones():
     assert predict(SCENE, np.array([high]), NOISE).saturated > 0.3
     assert high > 3 * low
     assert plan.coverage > max(
-        predict(SCENE, np.array([low]), NOISE).coverage, predict(SCENE, np.array([high]), NOISE).coverage
+        predict(SCENE, np.array([low]), NOISE).coverage,
+        predict(SCENE, np.array([high]), NOISE).coverage,
     )
