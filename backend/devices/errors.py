@@ -1,5 +1,7 @@
 """What a device refuses or fails at: one sentence with the device's name, the value and the way out."""
 
+# ruff: noqa: N818 - DeviceBusy, DeviceTimeout and so on say it; those are the names drivers use elsewhere too
+
 from backend.domain.errors import InvalidSettingError, NotFoundError, UnglareError
 
 

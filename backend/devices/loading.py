@@ -68,7 +68,8 @@ def open_rig(name: str, options: Mapping[str, object] | None = None) -> Rig:
             f"rig {name}: its factory returned a {type(rig).__name__} without {', '.join(missing)};"
             " see backend.devices.protocols.Rig"
         )
-    return rig
+    opened: Rig = rig
+    return opened
 
 
 def _factory(name: str) -> Callable[[Mapping[str, object]], Any]:

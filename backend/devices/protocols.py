@@ -20,7 +20,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.numerics.scoring import Truth
 
@@ -58,7 +57,7 @@ class Range:
 
     def __str__(self) -> str:
         """Write the range as an operator reads it."""
-        return f"{self.min:g} to {self.max:g} {self.unit}".rstrip()
+        return f"{self.min:.10g} to {self.max:.10g} {self.unit}".rstrip()
 
     def nearest(self, value: float) -> float:
         """Return the allowed value next to one that lies between the limits."""

@@ -39,7 +39,8 @@ class Truth:
     @property
     def base(self) -> Bool[np.ndarray, "h w"]:
         """The pixels that completeness is counted over."""
-        return self.lit_and_seen & ~self.edge_band
+        base: Bool[np.ndarray, "h w"] = self.lit_and_seen & ~self.edge_band
+        return base
 
 
 class Score(NamedTuple):
@@ -85,7 +86,7 @@ def score(
     *,
     outlier_mm: float = 0.5,
 ) -> Scores:
-    """Compare a cloud with the true surface.
+    r"""Compare a cloud with the true surface.
 
     How completeness and error are counted: base = pixels of the reference camera that the
     projector lights and every camera used sees, without those within 2 px of an occlusion or
@@ -120,7 +121,7 @@ def score(
     Notes
     -----
     With the ray's unit vector d and the true point q the signed error of a point p is
-    :math:`(p - q) \\cdot d`: a point that its method put slightly off the ray isn't charged for that.
+    :math:`(p - q) \cdot d`: a point that its method put slightly off the ray isn't charged for that.
 
     Examples
     --------

@@ -31,10 +31,10 @@ _PROFILE = np.array(
     ]
 )
 
-Map = Float[np.ndarray, "rows columns"]
+Map = Float[np.ndarray, "_rows _columns"]
 
 
-def bust(*, rows: int = 520, columns: int = 900) -> Mesh:
+def bust(*, rows: int = 400, columns: int = 640) -> Mesh:
     """Make the bust: base at y = 0, 190 mm high, facing +z."""
     height = (190.0 * np.sin(np.linspace(np.pi / 2, 0, rows)))[:, None]
     angle = np.linspace(0, 2 * np.pi, columns, endpoint=False)[None, :]
@@ -57,27 +57,31 @@ def _relief(angle: Map, height: Map, radius: Map) -> Map:
     """Return the displacement along the radius in [mm]: face, hair, beard, coat."""
     side = np.abs(angle) * radius
     face = bump(angle, 0.62) * bump(height - 134, 24)
-    return (
+    relief: Map = (
         _features(side, height)
         + _strands(angle, height) * _hairiness(angle, height) * (1 - 0.5 * face)
         + _coat(angle, height)
     )
+    return relief
 
 
 def _features(side: Map, height: Map) -> Map:
-    nose_top, nose_tip = 147.0, 127.0
-    along = np.clip((nose_top - height) / (nose_top - nose_tip), 0, 1.0)
-    below = bump(np.minimum(height - nose_tip, 0), 1.8)
-    nose = (2.0 + 8.5 * along**1.4) * bump(side, 3.0 + 1.6 * along) * below
-    nose = np.where(height > nose_top, 2.0 * bump(side, 4) * bump(height - nose_top, 5), nose)
-    eyes = -4.2 * bump(side - 14, 5.5) * bump(height - 141, 4.2)
-    lids = 2.4 * bump(side - 14, 4.2) * bump(height - 140.5, 2.2)
-    brows = 3.0 * bump(side - 14, 9) * bump(height - 148.5, 2.6)
-    cheeks = 2.4 * bump(side - 19, 8) * bump(height - 130, 6)
-    lip = 2.2 * bump(side, 8) * bump(height - 113, 2.0)
-    mouth = -2.2 * bump(side, 9) * bump(height - 116.4, 1.2)
-    moustache = 3.2 * bump(side - 8, 8) * bump(height - 120 + 0.25 * side, 2.8)
-    return nose + eyes + lids + brows + cheeks + lip + mouth + moustache
+    bridge, tip = 146.0, 127.0
+    along = np.clip((bridge - height) / (bridge - tip), 0, 1.0)
+    below = bump(np.minimum(height - tip, 0), 1.8)
+    above = bump(np.maximum(height - bridge, 0), 4.0)
+    nose = (2.5 + 8.0 * along**1.4) * bump(side, 3.2 + 1.6 * along) * below * above
+    wings = 2.6 * bump(side - 5.2, 2.2) * bump(height - 127.5, 2.4)
+    sockets = -4.6 * bump(side - 14.5, 6.0) * bump(height - 141, 4.8)
+    balls = 3.4 * bump(side - 14.5, 4.4) * bump(height - 140, 2.8)
+    lids = -1.1 * bump(side - 14.5, 5.0) * bump(height - 143.4, 0.8)
+    brows = 3.4 * bump(side - 14, 8.5) * bump(height - 149.5 + 0.012 * (side - 12) ** 2, 2.4)
+    cheeks = 2.4 * bump(side - 19, 7) * bump(height - 131, 6)
+    lip = 2.4 * bump(side, 7.5) * bump(height - 113, 1.9)
+    mouth = -2.2 * bump(side, 9) * bump(height - 116.2, 1.1)
+    moustache = 3.4 * bump(side - 8, 7.5) * bump(height - 120 + 0.28 * side, 2.6)
+    relief: Map = nose + wings + sockets + balls + lids + brows + cheeks + lip + mouth + moustache
+    return relief
 
 
 def _hairiness(angle: Map, height: Map) -> Map:
@@ -85,15 +89,17 @@ def _hairiness(angle: Map, height: Map) -> Map:
     hair = 1 / (1 + np.exp(-(height - 158 + 26 * np.minimum(np.abs(angle), 1.6)) / 3.0))
     hair = hair / (1 + np.exp(-(height - 96) / 4.0))
     beard = bump(angle, 0.75) * bump(height - 99, 11.0)
-    return np.clip(hair + 1.1 * beard, 0, 1.4)
+    share: Map = np.clip(hair + 1.1 * beard, 0, 1.4)
+    return share
 
 
 def _strands(angle: Map, height: Map) -> Map:
     """Return wavy locks, mean about +2 mm, in [mm]."""
     drift = height / 9.0 + 1.4 * np.sin(height / 11.0 + 2 * np.sin(2 * angle))
-    coarse = np.sin(17 * angle + drift) * np.sin(height / 4.2 + 3 * np.sin(5 * angle))
+    coarse = np.sin(17 * angle + drift) * np.sin(height / 5.5 + 3 * np.sin(5 * angle))
     fine = np.sin(41 * angle + 1.7 * drift + np.sin(height / 3.0))
-    return 2.4 + 1.2 * coarse + 0.45 * fine
+    locks: Map = 2.4 + 1.2 * coarse + 0.45 * fine
+    return locks
 
 
 def _coat(angle: Map, height: Map) -> Map:
@@ -103,4 +109,5 @@ def _coat(angle: Map, height: Map) -> Map:
     lapel = 2.2 / (1 + np.exp(-(np.abs(angle) - opening) / 0.03))
     folds = 0.7 * np.sin(7 * np.abs(angle) + height / 9.0)
     shirt = -1.2 * bump(angle, 0.04) * (height > 28)
-    return below * (lapel + folds + shirt)
+    relief: Map = below * (lapel + folds + shirt)
+    return relief

@@ -100,7 +100,6 @@ class SimulatedCamera(Link):
     @property
     def capabilities(self) -> CameraCapabilities:
         """What it can be set to."""
-        self._need_link()
         return CameraCapabilities(
             sensor_size=self._config.size,
             pixel_formats=tuple(_FORMATS),
@@ -118,6 +117,7 @@ class SimulatedCamera(Link):
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Check and apply settings."""
+        self._need_link()
         can = self.capabilities
         wanted = replace(
             settings,
@@ -133,11 +133,13 @@ class SimulatedCamera(Link):
         if wanted.trigger not in can.trigger_sources:
             allowed = ", ".join(can.trigger_sources)
             raise FeatureError(
-                self.name, f"TriggerSource {wanted.trigger} is not one of {allowed}; choose one of them"
+                self.name,
+                f"TriggerSource {wanted.trigger} is not one of {allowed}; choose one of them",
             )
         if wanted.roi is not None:
             raise UnsupportedFeature(
-                self.name, f"region {wanted.roi} can't be set, the whole sensor is read; leave it out"
+                self.name,
+                f"region {wanted.roi} can't be set, the whole sensor is read; leave it out",
             )
         self._refuse_while_armed(wanted)
         self._settings = wanted
@@ -146,7 +148,8 @@ class SimulatedCamera(Link):
     def _checked(self, feature: str, value: float, allowed: Range) -> float:
         if value not in allowed:
             raise FeatureError(
-                self.name, f"{feature} {value:g} {allowed.unit} is not within {allowed}; choose another"
+                self.name,
+                f"{feature} {value:.10g} {allowed.unit} is not within {allowed}; choose another",
             )
         return allowed.nearest(value)
 
@@ -266,7 +269,8 @@ class SimulatedCamera(Link):
                 raise DeviceTimeout(self.name, "waiting for a frame was aborted; arm again")
             if not self._queue:
                 raise DeviceTimeout(
-                    self.name, f"no frame came within {timeout_s:g} s; trigger one, or check the line"
+                    self.name,
+                    f"no frame came within {timeout_s:g} s; trigger one, or check the line",
                 )
             return self._queue.popleft()
 

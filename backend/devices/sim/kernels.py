@@ -4,13 +4,12 @@ Noise comes from a hash of (frame key, pixel index), not from a stream: a frame 
 thread computes which row.
 """
 
-# ruff: noqa: ANN001, ANN202 - numba kernels take their types from the call
-# mypy: allow-untyped-defs
-
 import threading
+from typing import Any
 
 import numba
 import numpy as np
+from jaxtyping import Float32
 from scipy.special import ndtri
 
 from backend.numerics.kernels import kernel, row_loop
@@ -21,17 +20,18 @@ LOCK = threading.Lock()
 _TABLE_SIZE = 4096
 
 
-def _normal_table():
+def _normal_table() -> Float32[np.ndarray, "n"]:
     """Return normal quantiles whose sum of two independent draws has variance 1."""
     table = ndtri((np.arange(_TABLE_SIZE) + 0.5) / _TABLE_SIZE)
-    return (table / table.std() / np.sqrt(2.0)).astype(np.float32)
+    scaled: Float32[np.ndarray, n] = (table / table.std() / np.sqrt(2.0)).astype(np.float32)
+    return scaled
 
 
 NORMAL = _normal_table()
 
 
 @row_loop
-def _mixed(x):
+def _mixed(x: Any) -> Any:
     """Scramble 32 bits: multiply and shift, so that every input bit reaches every output bit."""
     x = np.uint32(x ^ (x >> np.uint32(16)))
     x = np.uint32(x * np.uint32(0x7FEB352D))
@@ -41,7 +41,7 @@ def _mixed(x):
 
 
 @row_loop
-def _hash_row(first, key_a, key_b, bits):
+def _hash_row(first: Any, key_a: Any, key_b: Any, bits: Any) -> Any:
     """Two rounds: with one, two frames' noise would be shifted copies of each other."""
     for i in range(bits.size):
         x = _mixed(np.uint32(np.uint32(first) + np.uint32(i) + key_a))
@@ -49,7 +49,7 @@ def _hash_row(first, key_a, key_b, bits):
 
 
 @row_loop
-def _normal_row(bits, table, noise):
+def _normal_row(bits: Any, table: Any, noise: Any) -> Any:
     for i in range(noise.size):
         x = bits[i]
         low, high = x & np.uint32(4095), (x >> np.uint32(12)) & np.uint32(4095)
@@ -57,7 +57,15 @@ def _normal_row(bits, table, noise):
 
 
 @row_loop
-def _expose_row(charge, noise, read_variance, gray_per_e, black, full_scale, out):
+def _expose_row(
+    charge: Any,
+    noise: Any,
+    read_variance: Any,
+    gray_per_e: Any,
+    black: Any,
+    full_scale: Any,
+    out: Any,
+) -> Any:
     for i in range(out.size):
         e = charge[i]
         e += np.sqrt(e + read_variance) * noise[i]
@@ -66,7 +74,17 @@ def _expose_row(charge, noise, read_variance, gray_per_e, black, full_scale, out
 
 
 @kernel
-def expose(charge, key_a, key_b, table, read_variance, gray_per_e, black, full_scale, out):
+def expose(
+    charge: Any,
+    key_a: Any,
+    key_b: Any,
+    table: Any,
+    read_variance: Any,
+    gray_per_e: Any,
+    black: Any,
+    full_scale: Any,
+    out: Any,
+) -> None:
     """Turn charge [e] into gray levels: shot and read noise, gain, black level, rounding, clipping."""
     height, width = charge.shape
     for y in numba.prange(height):
@@ -78,7 +96,7 @@ def expose(charge, key_a, key_b, table, read_variance, gray_per_e, black, full_s
 
 
 @row_loop
-def _sampled(u, v, mix, pictures, last_x, last_y):
+def _sampled(u: Any, v: Any, mix: Any, pictures: Any, last_x: Any, last_y: Any) -> Any:
     """Interpolate the sharp and the soft picture at a projector pixel and mix them."""
     u = min(max(u, np.float32(0.0)), last_x)
     v = min(max(v, np.float32(0.0)), last_y)
@@ -93,19 +111,31 @@ def _sampled(u, v, mix, pictures, last_x, last_y):
 
 
 @row_loop
-def _sample_row(u, v, weight, mix, pictures, last_x, last_y, out):
+def _sample_row(
+    u: Any, v: Any, weight: Any, mix: Any, pictures: Any, last_x: Any, last_y: Any, out: Any
+) -> Any:
     for i in range(weight.size):
         out[i] += weight[i] * _sampled(u[i], v[i], mix[i], pictures, last_x, last_y)
 
 
 @row_loop
-def _room_row(white, room, ambient, out):
+def _room_row(white: Any, room: Any, ambient: Any, out: Any) -> Any:
     for i in range(out.size):
         out[i] = white * out[i] + room * ambient[i]
 
 
 @kernel
-def light(u, v, weight, mix, ambient, pictures, white, room, out):
+def light(
+    u: Any,
+    v: Any,
+    weight: Any,
+    mix: Any,
+    ambient: Any,
+    pictures: Any,
+    white: Any,
+    room: Any,
+    out: Any,
+) -> None:
     """Fill `out` with light: the sharp and the soft picture sampled, mixed and weighted, plus the room's."""
     samples, height, _ = weight.shape
     last_x, last_y = np.float32(pictures.shape[2] - 1.001), np.float32(pictures.shape[1] - 1.001)
@@ -117,26 +147,56 @@ def light(u, v, weight, mix, ambient, pictures, white, room, out):
 
 
 @row_loop
-def _bounce_row(pixel, u, v, weight, mix, pictures, white, last_x, last_y, out):
+def _bounce_row(
+    pixel: Any,
+    u: Any,
+    v: Any,
+    weight: Any,
+    mix: Any,
+    pictures: Any,
+    white: Any,
+    last_x: Any,
+    last_y: Any,
+    out: Any,
+) -> Any:
     for i in range(pixel.size):
         value = _sampled(u[i], v[i], mix[i], pictures, last_x, last_y)
         out[pixel[i]] += white * weight[i] * value
 
 
 @kernel
-def add_bounces(first, column, u, v, weight, mix, pictures, white, out):
+def add_bounces(
+    first: Any,
+    column: Any,
+    u: Any,
+    v: Any,
+    weight: Any,
+    mix: Any,
+    pictures: Any,
+    white: Any,
+    out: Any,
+) -> None:
     """Add light that came over a mirror; row y's entries are first[y]..first[y + 1], pixels may repeat."""
     last_x, last_y = np.float32(pictures.shape[2] - 1.001), np.float32(pictures.shape[1] - 1.001)
     for y in numba.prange(out.shape[0]):
         a, b = first[y], first[y + 1]
         if b > a:
             _bounce_row(
-                column[a:b], u[a:b], v[a:b], weight[a:b], mix[a:b], pictures, white, last_x, last_y, out[y]
+                column[a:b],
+                u[a:b],
+                v[a:b],
+                weight[a:b],
+                mix[a:b],
+                pictures,
+                white,
+                last_x,
+                last_y,
+                out[y],
             )
 
 
 @row_loop
-def _collect_row(rate, veil, glare, dark, exposure, out):
+def _collect_row(rate: Any, veil: Any, glare: Any, dark: Any, exposure: Any, out: Any) -> Any:
     highest = np.float32(0.0)
     for i in range(out.size):
         e = (rate[i] + glare * (veil[i] - rate[i]) + dark) * exposure
@@ -146,21 +206,23 @@ def _collect_row(rate, veil, glare, dark, exposure, out):
 
 
 @kernel
-def collect(rate, veil, glare, dark, exposure, out, highest):
+def collect(
+    rate: Any, veil: Any, glare: Any, dark: Any, exposure: Any, out: Any, highest: Any
+) -> None:
     """Fill `out` with the charge [e] of an exposure, part of the light replaced by glare; `highest` per row."""
     for y in numba.prange(out.shape[0]):
         highest[y] = _collect_row(rate[y], veil[y], glare, dark, exposure, out[y])
 
 
 @row_loop
-def _cut_row(charge, capacity, excess):
+def _cut_row(charge: Any, capacity: Any, excess: Any) -> Any:
     for i in range(charge.size):
         excess[i] = max(charge[i] - capacity, np.float32(0.0))
         charge[i] = min(charge[i], capacity)
 
 
 @row_loop
-def _spill_row(charge, excess, carried, capacity, share):
+def _spill_row(charge: Any, excess: Any, carried: Any, capacity: Any, share: Any) -> Any:
     for i in range(charge.size):
         taken = min(capacity - charge[i], carried[i])
         charge[i] += taken
@@ -168,7 +230,7 @@ def _spill_row(charge, excess, carried, capacity, share):
 
 
 @kernel
-def bloom(charge, capacity, share):
+def bloom(charge: Any, capacity: Any, share: Any) -> None:
     """Cut charge at the pixels' capacity; `share` of the rest runs along the column until there is room.
 
     A tenth of what runs is drained at each pixel, as anti-blooming gates do.

@@ -1,7 +1,5 @@
 """What surfaces do with light: diffuse albedo, a specular lobe, a mirror's share."""
 
-from typing import Self
-
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
@@ -20,7 +18,7 @@ class Material(BaseModel):
     """Share reflected as by a perfect mirror: shows other surfaces in it, and throws the pattern on them."""
 
     @model_validator(mode="after")
-    def _conserves_energy(self) -> Self:
+    def _conserves_energy(self) -> "Material":
         total = self.albedo + self.specular + self.mirror
         if total > 1.0 + 1e-9:
             raise ValueError(

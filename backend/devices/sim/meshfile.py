@@ -11,6 +11,7 @@ devices look; then the mesh is turned about x, y, z and moved. `materials` goes 
 in the file; `*` is for all others.
 """
 
+import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -105,8 +106,7 @@ _Object = tuple[
 def _read_objects(path: Path) -> list[_Object]:
     if not path.is_file():
         raise RigConfigError(f"mesh file {path} isn't there; check the path after mesh:")
-    import open3d as o3d
-
+    o3d: Any = importlib.import_module("open3d")  # slow, and its type stubs are wrong
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         model = o3d.io.read_triangle_model(str(path))
         pairs = [(info.mesh_name, info.mesh) for info in model.meshes]

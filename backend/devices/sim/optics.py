@@ -27,7 +27,7 @@ def defocus_variance_px2(
     diameter squared as variance per axis.
     """
     diameter = aperture_mm * focal_px * np.abs(1.0 / depth_mm - 1.0 / focus_mm)
-    variance: Float32[np.ndarray, "..."] = (diameter**2 / 16.0).astype(np.float32)
+    variance: Float32[np.ndarray, ...] = (diameter**2 / 16.0).astype(np.float32)
     return variance
 
 

@@ -41,7 +41,6 @@ class SimulatedProjector(Link):
     @property
     def capabilities(self) -> ProjectorCapabilities:
         """What it can do."""
-        self._need_link()
         period = self._config.frame_period_ms
         return ProjectorCapabilities(
             size=self._config.projector_size,
@@ -72,7 +71,8 @@ class SimulatedProjector(Link):
         self._need_link()
         if not 0 <= index < len(self._patterns):
             raise FeatureError(
-                self.name, f"there is no pattern {index}, {len(self._patterns)} are loaded; load first"
+                self.name,
+                f"there is no pattern {index}, {len(self._patterns)} are loaded; load first",
             )
         return self._present(self._patterns[index], index)
 

@@ -1,7 +1,6 @@
 """Camera pixels to rays and points to pixels, OpenCV's lens model, in the rig's frame."""
 
-# ruff: noqa: ANN001, ANN202 - numba kernels take their types from the call
-# mypy: allow-untyped-defs
+from typing import Any
 
 import numba
 import numpy as np
@@ -12,7 +11,7 @@ from backend.numerics.kernels import kernel, row_loop
 
 
 @row_loop
-def distorted(x, y, k):
+def distorted(x: Any, y: Any, k: Any) -> Any:
     """Apply OpenCV's k1 k2 p1 p2 k3 to normalised coordinates."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
@@ -52,7 +51,19 @@ def pixel_rays(
 
 
 @kernel
-def _pixel_rays(K, dist, R, origin, first_row, n_rows, width, dx, dy, rays, falloff):
+def _pixel_rays(
+    K: Any,
+    dist: Any,
+    R: Any,
+    origin: Any,
+    first_row: Any,
+    n_rows: Any,
+    width: Any,
+    dx: Any,
+    dy: Any,
+    rays: Any,
+    falloff: Any,
+) -> None:
     for row in numba.prange(n_rows):
         yd = (first_row + row + dy - K[1, 2]) / K[1, 1]
         for column in range(width):
@@ -91,7 +102,7 @@ def project(
 
 
 @kernel
-def _project(points, R, t, K, dist, uv, depth):
+def _project(points: Any, R: Any, t: Any, K: Any, dist: Any, uv: Any, depth: Any) -> None:
     for i in numba.prange(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]

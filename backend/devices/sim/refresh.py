@@ -20,7 +20,8 @@ def mean_light(gamma: float, contrast_ratio: float) -> Float32[np.ndarray, "256"
     """Return the light of each code over whole periods: 1 for white, 1 / contrast for black."""
     linear = (np.arange(256) / 255.0) ** gamma
     black = 1.0 / contrast_ratio
-    return (black + (1.0 - black) * linear).astype(np.float32)
+    light: Float32[np.ndarray, 256] = (black + (1.0 - black) * linear).astype(np.float32)
+    return light
 
 
 def whole_periods(exposure_ms: float, period_ms: float | None) -> bool:
@@ -57,11 +58,12 @@ def light_during(
     seen = bits @ on
     share = level / (2**_BITS - 1) * periods
     ratio = np.divide(seen, share, out=np.ones(256), where=level > 0)
-    return (mean * ratio).astype(np.float32)
+    light: Float32[np.ndarray, 256] = (mean * ratio).astype(np.float32)
+    return light
 
 
 def _on_time(until: float) -> Float[np.ndarray, "8"]:
     """Return how long each bit's slot has been open since time 0, in periods."""
     whole = np.floor(until)
-    open_: Float[np.ndarray, "8"] = whole * _WEIGHTS + np.clip(until - whole - _STARTS, 0, _WEIGHTS)
+    open_: Float[np.ndarray, 8] = whole * _WEIGHTS + np.clip(until - whole - _STARTS, 0, _WEIGHTS)
     return open_

@@ -32,9 +32,7 @@ class Beam:
             config.projector_blur_px**2 + soft_variance_px2,
         )
         self._mean = refresh.mean_light(config.gamma, config.contrast_ratio)
-        self._cache: OrderedDict[
-            int, Float32[np.ndarray, "2 h w"]
-        ] = OrderedDict()
+        self._cache: OrderedDict[int, Float32[np.ndarray, "2 h w"]] = OrderedDict()
         self._lock = Lock()
 
     def pictures(
@@ -47,7 +45,9 @@ class Beam:
         if self._period_ms is not None and not refresh.whole_periods(exposure_ms, self._period_ms):
             light = refresh.light_during(self._mean, exposure_ms, self._period_ms, phase)
             return self._blurred(shown.pattern, light)
-        with self._lock:  # a second camera waits for the first one's picture instead of making its own
+        with (
+            self._lock
+        ):  # a second camera waits for the first one's picture instead of making its own
             if shown.number not in self._cache:
                 self._cache[shown.number] = self._blurred(shown.pattern, self._mean)
                 if len(self._cache) > 3:
@@ -94,7 +94,7 @@ class LightPaths:
             )
         extra = paths.bounces
         if extra.pixel.size:
-            height, width = rate.shape
+            height, width = paths.ambient.shape
             rows = np.searchsorted(extra.pixel, np.arange(height + 1) * width)
             with kernels.LOCK:
                 kernels.add_bounces(

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from typing import Self
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
@@ -109,7 +108,7 @@ class SimulatedRig:
         for device in (*self._cameras.values(), self._projector):
             device.close()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "SimulatedRig":
         self.open()
         return self
 
@@ -183,7 +182,7 @@ class SimulatedRig:
         )
 
     def _phase(self, camera: int, frame_id: int) -> float:
-        """A software trigger comes at any moment of the projector's frame period."""
+        """Return where in its frame period the projector is at a software trigger: anywhere."""
         state = np.random.SeedSequence([self.config.seed, 1, camera, frame_id]).generate_state(1)
         return float(state[0]) / 2.0**32
 

@@ -22,10 +22,18 @@ from backend.devices.sim.materials import (
 )
 from backend.devices.sim.meshfile import scene_from_file
 from backend.devices.sim.scene import Part, Scene
-from backend.devices.sim.shapes import Mesh, box, convex, cylinder, join, plate, prism, sphere
+from backend.devices.sim.shapes import (
+    Mesh,
+    box,
+    cylinder,
+    join,
+    plate,
+    sphere,
+    turned_smooth,
+)
 
-BRUSHED_STEEL = Material(albedo=0.2, specular=0.22, roughness=0.24, mirror=0.16)
-"""Rolled sheet: broad highlight, blurred picture of its neighbourhood."""
+BRUSHED_STEEL = Material(albedo=0.16, specular=0.25, roughness=0.3, mirror=0.26)
+"""Rolled sheet: broad highlight, and a clear picture of its neighbourhood."""
 MACHINED = Material(albedo=0.16, specular=0.2, roughness=0.2, mirror=0.12)
 
 
@@ -68,29 +76,26 @@ def check_name(name: str) -> None:
 
 
 def _high_contrast() -> Scene:
-    head = bust().moved(-58, -112, 22, turn_deg=(0, 14, 0))
-    base = box(150, 14, 96, chamfer=1.5).moved(-58, -119, 18, turn_deg=(0, 14, 0))
+    plaster = bust().moved(-54, -112, 14, turn_deg=(0, 12, 0))
     return Scene(
         "high-contrast",
         (
-            Part("plaster", join([head, base]), PLASTER),
-            Part("blocks", _blocks().moved(78, -126, 18, turn_deg=(0, -6, 0)), WOOD),
-            Part("cover", _cover(190, 236).moved(28, -8, -52, turn_deg=(-6, 0, 0)), DARK_COVER),
+            Part("plaster", plaster, PLASTER),
+            Part("blocks", _blocks().moved(84, -112, 12, turn_deg=(0, -7, 0)), WOOD),
+            Part("cover", _cover(190, 236).moved(28, -6, -40, turn_deg=(-5, 0, 0)), DARK_COVER),
         ),
     )
 
 
 def _blocks() -> Mesh:
-    """Toy blocks: two cubes, a lintel, a roof and a column, standing on y = 0."""
+    """Make toy blocks standing on y = 0: two cubes, a lintel, a third cube."""
     cube = box(42, 42, 42, chamfer=1.2)
     return join(
         [
-            cube.moved(-26, 21, 0, turn_deg=(0, 4, 0)),
-            cube.moved(27, 21, 3, turn_deg=(0, -5, 0)),
+            cube.moved(-26, 21, 0, turn_deg=(0, 3, 0)),
+            cube.moved(27, 21, 3, turn_deg=(0, -6, 0)),
             box(98, 24, 40, chamfer=1.2).moved(0, 54.2, 0),
-            prism(np.array([(-34.0, 0), (34, 0), (0, 36)]), 38).moved(
-                4, 66.4, 0, turn_deg=(0, 3, 0)
-            ),
+            box(38, 38, 38, chamfer=1.2).moved(6, 85.4, 0, turn_deg=(0, -11, 0)),
         ]
     )
 
@@ -115,40 +120,37 @@ def _cover(width: float, height: float) -> Mesh:
 
 
 def _metal() -> Scene:
-    bracket = _bracket().moved(-52, -46, 14, turn_deg=(28, 16, 0))
+    bracket = _bracket().moved(-52, -46, 14, turn_deg=(22, 16, 0))
     return Scene(
         "metal",
         (
             Part("bracket", bracket, BRUSHED_STEEL),
-            Part(
-                "cover", _cover(150, 214).moved(84, 0, -24, turn_deg=(-4, -8, 0)), DARK_COVER
-            ),
+            Part("cover", _cover(150, 214).moved(84, 0, -24, turn_deg=(-4, -8, 0)), DARK_COVER),
         ),
     )
 
 
 def _bracket() -> Mesh:
-    """Make an angle bracket of sheet: a wall with two holes, a foot with two, ribs at the ends."""
-    width, thick = 128.0, 5.0
-    wall = plate(width, 104, thick, [(-36, 18, 9), (36, 18, 9)]).moved(0, 52, 0)
-    foot = plate(width, 62, thick, [(-36, -8, 8), (36, -8, 8)]).moved(
-        0, thick / 2, thick / 2 + 31, turn_deg=(-90, 0, 0)
+    """Make an angle bracket of sheet: a wall with two holes and a pressed boss, a foot with two holes, rolled edges."""
+    width, height, reach, thick = 128.0, 112.0, 54.0, 5.0
+    wall = plate(width, height, thick, [(-36, 22, 9), (36, 22, 9)]).moved(0, height / 2, 0)
+    foot = plate(width, reach, thick, [(-36, -4, 8), (36, -4, 8)]).moved(
+        0, thick / 2, (thick + reach) / 2, turn_deg=(-90, 0, 0)
     )
-    rib = prism(np.array([(0.0, 0.0), (40, 0), (0, 50)]), 4)
-    ribs = [
-        rib.moved(side * (width / 2 - 2), thick, thick / 2, turn_deg=(0, -90, 0))
-        for side in (-1, 1)
+    boss = _dome(21, 6).moved(0, 72, thick / 2)
+    edge = cylinder(4.5, width, chamfer=1.0)
+    rolled = [
+        edge.moved(0, height, 0, turn_deg=(0, 90, 0)),
+        edge.moved(0, thick / 2, thick / 2 + reach, turn_deg=(0, 90, 0)),
     ]
-    bolt = convex(_hexagon(7.5, 4.5)).moved(0, 52, thick / 2 + 2.2)
-    return join([wall, foot, *ribs, bolt])
+    return join([wall, foot, boss, *rolled])
 
 
-def _hexagon(radius: float, length: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    angle = np.arange(6) * np.pi / 3 + 0.2
-    ring = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    return np.concatenate(
-        [np.column_stack([ring, np.full(6, z)]) for z in (-length / 2, length / 2)]
-    )
+def _dome(radius: float, height: float) -> Mesh:
+    """Make a pressed boss on z = 0: a cap of a sphere that is `height` high."""
+    r = (radius**2 + height**2) / (2 * height)
+    polar = np.linspace(np.arcsin(radius / r), 1e-4, 60)
+    return turned_smooth(np.column_stack([r * np.sin(polar), r * np.cos(polar) - r + height]))
 
 
 def _workpieces() -> Scene:
@@ -173,9 +175,7 @@ def _housing() -> Mesh:
     """Make a moulded plug housing lying on z = 0: body, collar, two sockets, ribs."""
     body = box(84, 92, 30, chamfer=4).moved(0, 0, 15)
     collar = box(60, 66, 12, chamfer=3).moved(0, 4, 33)
-    sockets = [
-        cylinder(11, 14, chamfer=1.5).moved(side * 15, 14, 42) for side in (-1, 1)
-    ]
+    sockets = [cylinder(11, 14, chamfer=1.5).moved(side * 15, 14, 42) for side in (-1, 1)]
     ribs = [box(50, 4, 8, chamfer=1).moved(0, -12 - 9 * row, 40) for row in range(2)]
     flange = box(104, 26, 10, chamfer=2).moved(0, -40, 5)
     return join([body, collar, *sockets, *ribs, flange])

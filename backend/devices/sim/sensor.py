@@ -39,7 +39,7 @@ class Sensor:
         bits: int,
         frame_key: int,
     ) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
-        """Expose, read out and quantise one frame.
+        r"""Expose, read out and quantise one frame.
 
         Parameters
         ----------
@@ -56,7 +56,7 @@ class Sensor:
 
         Notes
         -----
-        .. math:: I = b + g (N + \\sqrt{N + r^2} z), \\qquad g = G (2^{bits} - 1) / F
+        .. math:: I = b + g (N + \sqrt{N + r^2} z), \qquad g = G (2^{bits} - 1) / F
 
         with N the charge, F the full well, r the read noise, G the gain factor, z standard normal: shot noise
         as a normal distribution, which above some 20 electrons it is.

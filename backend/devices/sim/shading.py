@@ -3,10 +3,7 @@
 One kernel serves camera rays and rays mirrored once; it also prepares the shadow rays.
 """
 
-# ruff: noqa: ANN001, ANN202 - numba kernels take their types from the call
-# mypy: allow-untyped-defs
-
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -86,7 +83,7 @@ def light_at(
     scene: Surfaces,
     projector: View,
 ) -> Lighting:
-    """Shade what rays hit, before shadows are known.
+    r"""Shade what rays hit, before shadows are known.
 
     Parameters
     ----------
@@ -106,7 +103,7 @@ def light_at(
     With n.l and n.v the cosines towards light and ray, d the distance from the projector and d0 that of
     reference, the weight is
 
-    .. math:: (\\rho + \\pi f_s) (n \\cdot l) (d_0 / d)^2
+    .. math:: (\rho + \pi f_s) (n \cdot l) (d_0 / d)^2
 
     where f_s is a GGX microfacet lobe with Smith's height-correlated shadowing in Hammon's approximation
     and Schlick's Fresnel term. A point off the projector's picture gets weight 0.
@@ -144,7 +141,7 @@ def light_at(
 
 
 @row_loop
-def reflectance(nl, nv, nh, vh, material):
+def reflectance(nl: Any, nv: Any, nh: Any, vh: Any, material: Any) -> Any:
     """Return pi times the BRDF for the cosines of light, view and half-way vector."""
     albedo, specular, alpha = material[0], material[1], material[2]
     if specular <= 0.0:
@@ -160,10 +157,33 @@ def reflectance(nl, nv, nh, vh, material):
 
 @kernel
 def _shade(
-    rays, hit, tri, bary, triangles, corner_normals, face_n, tri_part, materials,
-    light, R, t, K, dist, width, height,
-    point, normal, uv, lit, weight, ambient, mirror, depth, part, shadow,
-):
+    rays: Any,
+    hit: Any,
+    tri: Any,
+    bary: Any,
+    triangles: Any,
+    corner_normals: Any,
+    face_n: Any,
+    tri_part: Any,
+    materials: Any,
+    light: Any,
+    R: Any,
+    t: Any,
+    K: Any,
+    dist: Any,
+    width: Any,
+    height: Any,
+    point: Any,
+    normal: Any,
+    uv: Any,
+    lit: Any,
+    weight: Any,
+    ambient: Any,
+    mirror: Any,
+    depth: Any,
+    part: Any,
+    shadow: Any,
+) -> None:
     n_triangles = triangles.shape[0]
     for i in numba.prange(rays.shape[0]):
         if not np.isfinite(hit[i]) or tri[i] < 0 or tri[i] >= n_triangles:
@@ -177,9 +197,21 @@ def _shade(
         gx, gy, gz = face_n[k, 0], face_n[k, 1], face_n[k, 2]
         side = -1.0 if gx * rays[i, 3] + gy * rays[i, 4] + gz * rays[i, 5] > 0 else 1.0
         gx, gy, gz = side * gx, side * gy, side * gz
-        nx = side * (b0 * corner_normals[k, 0, 0] + b1 * corner_normals[k, 1, 0] + b2 * corner_normals[k, 2, 0])
-        ny = side * (b0 * corner_normals[k, 0, 1] + b1 * corner_normals[k, 1, 1] + b2 * corner_normals[k, 2, 1])
-        nz = side * (b0 * corner_normals[k, 0, 2] + b1 * corner_normals[k, 1, 2] + b2 * corner_normals[k, 2, 2])
+        nx = side * (
+            b0 * corner_normals[k, 0, 0]
+            + b1 * corner_normals[k, 1, 0]
+            + b2 * corner_normals[k, 2, 0]
+        )
+        ny = side * (
+            b0 * corner_normals[k, 0, 1]
+            + b1 * corner_normals[k, 1, 1]
+            + b2 * corner_normals[k, 2, 1]
+        )
+        nz = side * (
+            b0 * corner_normals[k, 0, 2]
+            + b1 * corner_normals[k, 1, 2]
+            + b2 * corner_normals[k, 2, 2]
+        )
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
         if length < 1e-6:
             nx, ny, nz, length = gx, gy, gz, 1.0
@@ -238,7 +270,9 @@ def facet_weight(
 
 
 @kernel
-def _facet_weight(point, normal, direction, materials, light, weight):
+def _facet_weight(
+    point: Any, normal: Any, direction: Any, materials: Any, light: Any, weight: Any
+) -> None:
     for i in numba.prange(point.shape[0]):
         d2, nl, nv = 0.0, 0.0, 0.0
         for k in range(3):

@@ -5,6 +5,7 @@ Local frame of every shape: x right, y up, z towards the viewer, in mm.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
@@ -33,7 +34,7 @@ class Mesh:
     ) -> "Mesh":
         """Turn about the local x, then y, then z axis, then move by (x, y, z) in [mm]."""
         R = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
-        return self.transformed(R, np.array([x, y, z]))
+        return self.transformed(R, np.array([x, y, z], np.float64))
 
     def transformed(self, R: Float[np.ndarray, "3 3"], t_mm: Float[np.ndarray, "3"]) -> "Mesh":
         """Apply x -> R x + t to the vertices and R to the normals."""
@@ -83,9 +84,13 @@ def smooth(
     """Make a mesh whose normals are the area-weighted means around each vertex."""
     a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
-    sums = np.zeros_like(vertices_mm)
-    for corner in range(3):
-        np.add.at(sums, triangles[:, corner], weighted)
+    per_corner = np.repeat(weighted, 3, axis=0)
+    sums = np.column_stack(
+        [
+            np.bincount(triangles.ravel(), per_corner[:, axis], minlength=len(vertices_mm))
+            for axis in range(3)
+        ]
+    )
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)
     normals = sums / np.where(lengths > 0, lengths, 1.0)
     return Mesh(vertices_mm, triangles, normals[triangles].astype(np.float32))
@@ -142,12 +147,18 @@ def _ring(radius: float, n: int) -> Float[np.ndarray, "n 2"]:
 def turned(profile_mm: Float[np.ndarray, "n 2"], *, segments: int = 160) -> Mesh:
     """Turn a profile of (radius, z), from the back to the front, about the z axis: smooth round, flat at corners."""
     pieces = []
-    for (r0, z0), (r1, z1) in zip(profile_mm[:-1], profile_mm[1:], strict=True):
+    for (r0, z0), (r1, z1) in pairwise(profile_mm):
         back = np.column_stack([_ring(r0, segments), np.full(segments, z0)])
         front = np.column_stack([_ring(r1, segments), np.full(segments, z1)])
         pieces.append(grid(np.stack([front, back]), closed=True))
     # The normals of each piece are those of its own cone: `grid` never averages over a corner.
     return join(pieces)
+
+
+def turned_smooth(profile_mm: Float[np.ndarray, "n 2"], *, segments: int = 160) -> Mesh:
+    """Turn a profile as `turned` does, smooth along the profile too."""
+    rings = [np.column_stack([_ring(r, segments), np.full(segments, z)]) for r, z in profile_mm]
+    return grid(np.stack(rings[::-1]), closed=True)
 
 
 def cylinder(radius: float, length: float, *, chamfer: float = 0.0, segments: int = 160) -> Mesh:
@@ -192,11 +203,11 @@ def plate(
     if not holes:
         return box(width, height, thickness)
     ordered = sorted(holes)
-    middles = [(a[0] + b[0]) / 2 for a, b in zip(ordered, ordered[1:], strict=False)]
+    middles = [(a[0] + b[0]) / 2 for a, b in pairwise(ordered)]
     cuts = [-width / 2, *middles, width / 2]
     pieces = [
         _holed_cell(left, right, height, thickness, hole, segments)
-        for left, right, hole in zip(cuts, cuts[1:], ordered, strict=False)
+        for (left, right), hole in zip(pairwise(cuts), ordered, strict=True)
     ]
     return join([*pieces, *_rim(width, height, thickness)])
 
@@ -220,9 +231,7 @@ def _holed_cell(
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
     with np.errstate(divide="ignore"):
         reach_x = np.where(directions[:, 0] > 0, right - x, left - x) / directions[:, 0]
-        reach_y = (
-            np.where(directions[:, 1] > 0, height / 2 - y, -height / 2 - y) / directions[:, 1]
-        )
+        reach_y = np.where(directions[:, 1] > 0, height / 2 - y, -height / 2 - y) / directions[:, 1]
     outer = directions * np.minimum(np.abs(reach_x), np.abs(reach_y))[:, None] + (x, y)
     inner = directions * radius + (x, y)
     n, z = len(angles), np.full((len(angles), 1), thickness / 2)
@@ -244,7 +253,9 @@ def _rim(width: float, height: float, thickness: float) -> list[Mesh]:
     return sides
 
 
-def bump(distance: Float[np.ndarray, "..."], width: float) -> Float[np.ndarray, "..."]:
+def bump(
+    distance: Float[np.ndarray, "..."], width: float | Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "..."]:
     """Return a Gaussian bump of height 1 over a distance."""
-    value: Float[np.ndarray, "..."] = np.exp(-0.5 * (distance / width) ** 2)
+    value: Float[np.ndarray, ...] = np.exp(-0.5 * (distance / width) ** 2)
     return value

@@ -9,9 +9,10 @@ picture on other surfaces; the light seems to come from the projector's mirror i
 Curved mirrors are seen in but throw no light (no caustics).
 """
 
+import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
@@ -26,9 +27,6 @@ from backend.devices.sim.shading import (
     facet_weight,
     light_at,
 )
-
-if TYPE_CHECKING:
-    from open3d.t.geometry import RaycastingScene
 
 _CHUNK = 1 << 18
 """Rays per cast: bounds memory at any picture size."""
@@ -64,23 +62,20 @@ class Caster:
     """A scene that rays can be cast into."""
 
     def __init__(self, scene: Surfaces, projector: View) -> None:
-        import open3d as o3d  # 0.6 s and 100 MB: only when a simulated rig is opened
-
+        # 0.6 s and 100 MB: only when a simulated rig is opened. Its type stubs are wrong: Any.
+        o3d: Any = importlib.import_module("open3d")
         self.surfaces = scene
         self.projector = projector
-        self._tensor: Any = o3d.core.Tensor
-        self._scene: RaycastingScene = o3d.t.geometry.RaycastingScene()
+        self._tensor = o3d.core.Tensor
+        self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            o3d.core.Tensor(scene.vertices_mm),
-            o3d.core.Tensor(scene.triangles.astype(np.uint32)),
+            self._tensor(scene.vertices_mm), self._tensor(scene.triangles.astype(np.uint32))
         )
 
     def light(self, rays: Float32[np.ndarray, "n 6"]) -> tuple[Lighting, Int32[np.ndarray, "n"]]:
         """Cast rays and shade what they hit, shadows included. Also return the triangle hit, -1 for none."""
         hit_mm, triangle, barycentric = self.first_hit(rays)
-        lighting = light_at(
-            rays, hit_mm, triangle, barycentric, self.surfaces, self.projector
-        )
+        lighting = light_at(rays, hit_mm, triangle, barycentric, self.surfaces, self.projector)
         candidates = np.flatnonzero(lighting.lit)
         dark = candidates[self.blocked(lighting.shadow_rays[candidates])]
         lighting.lit[dark] = False
@@ -89,9 +84,7 @@ class Caster:
 
     def first_hit(
         self, rays: Float32[np.ndarray, "n 6"]
-    ) -> tuple[
-        Float32[np.ndarray, "n"], Int32[np.ndarray, "n"], Float32[np.ndarray, "n 2"]
-    ]:
+    ) -> tuple[Float32[np.ndarray, "n"], Int32[np.ndarray, "n"], Float32[np.ndarray, "n 2"]]:
         """Return distance in ray lengths (inf: none), triangle (-1: none) and barycentric coordinates."""
         hits = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))
         return (
@@ -100,7 +93,9 @@ class Caster:
             hits["primitive_uvs"].numpy(),
         )
 
-    def blocked(self, rays: Float32[np.ndarray, "n 6"]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def blocked(
+        self, rays: Float32[np.ndarray, "n 6"]
+    ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Tell which rays hit something before they are one length long."""
         if not len(rays):
             return np.zeros(0, bool)
@@ -184,7 +179,8 @@ def _seen_in_mirror(
     lit = second.weight > 0
     return Bounces(
         pixel[lit].astype(np.int32),
-        *second.uv_px[lit].T.copy(),
+        second.uv_px[lit, 0],
+        second.uv_px[lit, 1],
         (second.weight * factor)[lit],
         second.depth_mm[lit],
     )
@@ -203,9 +199,7 @@ class Facet(NamedTuple):
     mirror: float
 
 
-def mirror_facets(
-    scene: Surfaces, projector: View, *, min_area_mm2: float = 60.0
-) -> list[Facet]:
+def mirror_facets(scene: Surfaces, projector: View, *, min_area_mm2: float = 60.0) -> list[Facet]:
     """Find the flat mirror facets that face the projector, by common normal and plane."""
     mirror = scene.materials[scene.part, 3]
     candidates = np.flatnonzero(mirror > 0)
@@ -285,7 +279,8 @@ def _lit_by_mirror(
     first_mm = np.linalg.norm(on_mirror[free] - caster.projector.position_mm, axis=1)
     return Bounces(
         pixel.astype(np.int32),
-        *uv[free].T.copy(),
+        uv[free, 0],
+        uv[free, 1],
         (weight * share[pixel]).astype(np.float32),
         (depth[free] * way_mm / first_mm).astype(np.float32),
     )

@@ -33,9 +33,7 @@ class World:
     def __init__(self, config: SimulatedRigConfig) -> None:
         self.layout: Layout = layout(config)
         self._parts = scene(config.scene)
-        self._caster = Caster(
-            surfaces(self._parts, config.distance_mm), self.layout.projector
-        )
+        self._caster = Caster(surfaces(self._parts, config.distance_mm), self.layout.projector)
         self.transports: dict[str, Transport] = {
             name: cast(self._caster, camera, config.samples)
             for name, camera in self.layout.cameras.items()
