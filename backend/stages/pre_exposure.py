@@ -188,14 +188,14 @@ def _bisect(
 def _next_step(
     white: Exposed, facts: RigFacts, params: PreExposureParams, below: int, above: int, step: int
 ) -> int:
-    """Jump where a linear camera would just saturate; halve the bracket where that is no help."""
+    """Jump where a linear camera would just saturate; after a jump too far, stay near its end."""
     if below == step:
         brightest = max(
             _brightest(f, facts.cameras[n], params.saturated_share) for n, f in white.items()
         )
-        guess = int(step * 0.99 / max(brightest, 0.01))
+        guess = max(int(step / max(brightest, 0.01)), below + max(1, below // 50))
     else:
-        guess = (below + above) // 2 if below > 0 else step // 4
+        guess = max((below + above) // 2, int(0.95 * above)) if below > 0 else step // 4
     return int(np.clip(guess, below + 1, above - 1))
 
 
