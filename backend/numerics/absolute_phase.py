@@ -123,7 +123,7 @@ def decode_frames(
     settings = _settings(code, orders, limits or Limits(), size_px, black_gray)
     kernels.decode_frames(
         stack.addresses,
-        stack.sample,
+        stack.wide,
         stack.shape[0] * stack.shape[1],
         _with_average(steps_of(code)),
         _coarse(orders, coarse_px, stack.shape),
@@ -310,12 +310,11 @@ def _kernel_maps(maps: AbsolutePhase) -> kernels.Maps:
 
 
 def warm_up_kernels() -> None:
-    """Compile this module's kernels for the types of frames there are, see `warm_up`."""
+    """Compile this module's kernels, see `warm_up`."""
     code = SineCode.equal_steps((1,), 4)
     orders = hierarchical(code.periods)
-    for dtype in (np.uint8, np.uint16):
-        frames = [np.zeros((1, 1), dtype)] * 4
-        decode_frames(frames, code, orders, size_px=1, saturation_gray=255.0)
+    frames = [np.zeros((1, 1), np.uint8)] * 4
+    decode_frames(frames, code, orders, size_px=1, saturation_gray=255.0)
     plane, picture = np.zeros((1, 1, 1), np.float32), np.zeros((1, 1), np.float32)
     phasors = Phasors(
         plane, plane, plane, picture, picture.astype(np.uint8), *[picture.astype(np.uint16)] * 2

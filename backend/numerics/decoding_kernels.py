@@ -220,7 +220,7 @@ def _locate_tile(
 @row_loop
 def _decode_block(
     addresses: Any,
-    sample: Any,
+    wide: Any,
     n_px: Any,
     block: Any,
     steps: Any,
@@ -233,13 +233,13 @@ def _decode_block(
     maps: Any,
 ) -> None:
     rows = new_rows(steps.first_frame.size - 1)
-    peaks = np.empty(TILE, sample.dtype)
+    peaks = np.empty(TILE, np.uint16)
     for start in range(block, min(block + BLOCK, n_px), TILE):
         n = min(TILE, n_px - start)
         variance = rows.single[11, :n]
         # The sum of all frequencies' means; `decode_frames` gets weights that make it the average.
         means = rows.mean[:1]
-        demodulate(addresses, sample, start, n, steps, rows.cosine, rows.sine, means, peaks[:n])
+        demodulate(addresses, wide, start, n, steps, rows.cosine, rows.sine, means, peaks[:n])
         mean = means[0, :n]
         fill(rows.reasons, VALID)
         _flag_saturated(peaks[:n], np.float32(saturation), rows.reasons[:n])
@@ -271,7 +271,7 @@ def _decode_block(
 @kernel
 def decode_frames(
     addresses: Any,
-    sample: Any,
+    wide: Any,
     n_px: Any,
     steps: Any,
     coarse_px: Any,
@@ -286,7 +286,7 @@ def decode_frames(
     for block in numba.prange((n_px + BLOCK - 1) // BLOCK):
         _decode_block(
             addresses,
-            sample,
+            wide,
             n_px,
             block * BLOCK,
             steps,

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from backend.numerics.kernels import frame_part, kernel, row_loop
+from backend.numerics.kernels import kernel, narrow_part, row_loop, wide_part
 from backend.numerics.reasons import Reason
 from backend.numerics.sinusoid_rows import (
     BLOCK,
@@ -141,7 +141,7 @@ def _store_fused(
 @row_loop
 def _fuse_block(
     addresses: Any,
-    sample: Any,
+    wide: Any,
     n_px: Any,
     block: Any,
     steps: Any,
@@ -154,7 +154,7 @@ def _fuse_block(
     n_frequencies = steps.first_frame.size - 1
     n_frames = steps.first_frame[n_frequencies]
     rows = new_rows(n_frequencies)
-    peaks = np.empty(TILE, sample.dtype)
+    peaks = np.empty(TILE, np.uint16)
     index_row, usable_row = np.empty(TILE, np.int32), np.empty(TILE, np.int32)
     single = rows.single
     for start in range(block, min(block + BLOCK, n_px), TILE):
@@ -179,7 +179,7 @@ def _fuse_block(
             black = np.float32(exposures.black_gray)
             demodulate(
                 addresses[first : first + n_frames],
-                sample,
+                wide,
                 start,
                 n,
                 steps,
@@ -189,11 +189,15 @@ def _fuse_block(
                 peak,
             )
             for frame in range(first, first + n_frames):
-                count_saturated(
-                    frame_part(addresses[frame], start, n, sample),
-                    np.float32(saturation),
-                    fused.saturated_samples[start:end],
-                )
+                count = fused.saturated_samples[start:end]
+                if wide:
+                    count_saturated(
+                        wide_part(addresses[frame], start, n), np.float32(saturation), count
+                    )
+                else:
+                    count_saturated(
+                        narrow_part(addresses[frame], start, n), np.float32(saturation), count
+                    )
             average(rows.mean, 0, mean)
             predict_variance(
                 mean,
@@ -245,7 +249,7 @@ def _fuse_block(
 @kernel
 def fuse_exposures(
     addresses: Any,
-    sample: Any,
+    wide: Any,
     n_px: Any,
     steps: Any,
     exposures: Any,
@@ -258,7 +262,7 @@ def fuse_exposures(
     for block in numba.prange((n_px + BLOCK - 1) // BLOCK):
         _fuse_block(
             addresses,
-            sample,
+            wide,
             n_px,
             block * BLOCK,
             steps,
@@ -288,7 +292,7 @@ def _store_rms(total: Any, inverse_freedom: Any, rms: Any) -> None:
 @row_loop
 def _misfit_block(
     addresses: Any,
-    sample: Any,
+    wide: Any,
     n_px: Any,
     block: Any,
     steps: Any,
@@ -297,31 +301,30 @@ def _misfit_block(
     rms: Any,
 ) -> None:
     rows = new_rows(steps.first_frame.size - 1)
-    peaks = np.empty(TILE, sample.dtype)
+    peaks = np.empty(TILE, np.uint16)
     total_row = rows.single[0]
     for start in range(block, min(block + BLOCK, n_px), TILE):
         n = min(TILE, n_px - start)
         total = total_row[:n]
-        demodulate(addresses, sample, start, n, steps, rows.cosine, rows.sine, rows.mean, peaks[:n])
+        demodulate(addresses, wide, start, n, steps, rows.cosine, rows.sine, rows.mean, peaks[:n])
         fill(total, ZERO)
         for k in range(steps.first_frame.size - 1):
             for frame in range(steps.first_frame[k], steps.first_frame[k + 1]):
-                _add_square_misfit(
-                    frame_part(addresses[frame], start, n, sample),
-                    design[0, frame],
-                    design[1, frame],
-                    rows.cosine[k, :n],
-                    rows.sine[k, :n],
-                    rows.mean[k, :n],
-                    total,
-                )
+                in_phase, quadrature = design[0, frame], design[1, frame]
+                c, q, m = rows.cosine[k, :n], rows.sine[k, :n], rows.mean[k, :n]
+                if wide:
+                    a = wide_part(addresses[frame], start, n)
+                    _add_square_misfit(a, in_phase, quadrature, c, q, m, total)
+                else:
+                    b = narrow_part(addresses[frame], start, n)
+                    _add_square_misfit(b, in_phase, quadrature, c, q, m, total)
         _store_rms(total, inverse_freedom, rms[start : start + n])
 
 
 @kernel
 def sinusoid_misfit(
-    addresses: Any, sample: Any, n_px: Any, steps: Any, design: Any, inverse_freedom: Any, rms: Any
+    addresses: Any, wide: Any, n_px: Any, steps: Any, design: Any, inverse_freedom: Any, rms: Any
 ) -> None:
     """Measure the rms distance of the frames from the sinusoids, see `phasors.sinusoid_misfit`."""
     for block in numba.prange((n_px + BLOCK - 1) // BLOCK):
-        _misfit_block(addresses, sample, n_px, block * BLOCK, steps, design, inverse_freedom, rms)
+        _misfit_block(addresses, wide, n_px, block * BLOCK, steps, design, inverse_freedom, rms)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt16
 
 from backend.numerics.errors import CodeError, FrameError
-from backend.numerics.kernels import frame_part, frame_stack, kernel, row_loop
+from backend.numerics.kernels import frame_stack, kernel, narrow_part, row_loop, wide_part
 from backend.numerics.reasons import Reason
 
 _TILE = 2048
@@ -88,9 +88,7 @@ def decode_gray_code(
         )
     reading = _reading(bits, codes, ignored_low_bits, unjudged_low_bits)
     frames = [*patterns[: reading.read], *inverses[: reading.read]]
-    return _decode(
-        frames, reading, _INVERSE, codes, size_px, min_contrast_gray, saturation_gray
-    )
+    return _decode(frames, reading, _INVERSE, codes, size_px, min_contrast_gray, saturation_gray)
 
 
 def decode_gray_code_by_reference(
@@ -209,7 +207,7 @@ def _decode(
     )
     _decode_gray(
         stack.addresses,
-        stack.sample,
+        stack.wide,
         result.code.size,
         reading.read,
         mode,
@@ -319,46 +317,66 @@ def _store(
 
 
 @row_loop
+def _read_inverse(
+    addresses: Any, wide: Any, start: Any, n: Any, bits: Any, decision: Any, rows: Any
+) -> None:
+    """Read all bits of one tile, each against its inverse."""
+    binary, code, brightest = rows[0, :n], rows[1, :n], rows[4, :n]
+    for bit in range(bits):
+        weakest = rows[2 if bit < decision.judged else 5, :n]
+        first, second = addresses[bit], addresses[bits + bit]
+        if wide:
+            p, q = wide_part(first, start, n), wide_part(second, start, n)
+            _read_bit(p, q, binary, code, weakest)
+            if decision.saturation <= 0xFFFF:
+                _keep_both_bright(p, q, brightest)
+        else:
+            a, b = narrow_part(first, start, n), narrow_part(second, start, n)
+            _read_bit(a, b, binary, code, weakest)
+            if decision.saturation <= 0xFFFF:
+                _keep_both_bright(a, b, brightest)
+
+
+@row_loop
+def _read_against(
+    addresses: Any, wide: Any, start: Any, n: Any, bits: Any, decision: Any, rows: Any
+) -> None:
+    """Read all bits of one tile against a reference: the fields that follow the bits, or a threshold."""
+    binary, code, reference, brightest = rows[0, :n], rows[1, :n], rows[3, :n], rows[4, :n]
+    _fill(reference, np.int32(decision.double_threshold))
+    for field in range(bits, addresses.size):
+        if wide:
+            _add_to_reference(wide_part(addresses[field], start, n), reference)
+        else:
+            _add_to_reference(narrow_part(addresses[field], start, n), reference)
+        if field == bits:
+            _add_to_reference(reference, brightest)
+    for bit in range(bits):
+        weakest = rows[2 if bit < decision.judged else 5, :n]
+        if wide:
+            _read_bit_against(wide_part(addresses[bit], start, n), reference, binary, code, weakest)
+        else:
+            _read_bit_against(
+                narrow_part(addresses[bit], start, n), reference, binary, code, weakest
+            )
+
+
+@row_loop
 def _decode_block(
-    addresses: Any,
-    sample: Any,
-    n_px: int,
-    block: int,
-    bits: int,
-    mode: int,
-    decision: Any,
-    maps: Any,
+    addresses: Any, wide: Any, n_px: Any, block: Any, bits: Any, mode: Any, decision: Any, maps: Any
 ) -> None:
     rows = np.empty((6, _TILE), np.int32)
     for start in range(block, min(block + _BLOCK, n_px), _TILE):
         n = min(_TILE, n_px - start)
         end = start + n
-        binary, code, contrast = rows[0, :n], rows[1, :n], rows[2, :n]
-        reference, brightest, unjudged = rows[3, :n], rows[4, :n], rows[5, :n]
-        _fill(binary, _0)
-        _fill(code, _0)
+        code, contrast, brightest = rows[1, :n], rows[2, :n], rows[4, :n]
+        for row in range(6):
+            _fill(rows[row, :n], _0)
         _fill(contrast, np.int32(0xFFFF))
-        _fill(brightest, _0)
-        _fill(unjudged, _0)
         if mode == _INVERSE:
-            for bit in range(bits):
-                pattern = frame_part(addresses[bit], start, n, sample)
-                inverse = frame_part(addresses[bits + bit], start, n, sample)
-                weakest = contrast if bit < decision.judged else unjudged
-                _read_bit(pattern, inverse, binary, code, weakest)
-                if decision.saturation <= 0xFFFF:
-                    _keep_both_bright(pattern, inverse, brightest)
+            _read_inverse(addresses, wide, start, n, bits, decision, rows)
         else:
-            _fill(reference, np.int32(decision.double_threshold))
-            if mode == _WHITE_BLACK:
-                white = frame_part(addresses[bits], start, n, sample)
-                _add_to_reference(white, reference)
-                _add_to_reference(frame_part(addresses[bits + 1], start, n, sample), reference)
-                _add_to_reference(white, brightest)
-            for bit in range(bits):
-                pattern = frame_part(addresses[bit], start, n, sample)
-                weakest = contrast if bit < decision.judged else unjudged
-                _read_bit_against(pattern, reference, binary, code, weakest)
+            _read_against(addresses, wide, start, n, bits, decision, rows)
         _store(
             code,
             contrast,
@@ -373,10 +391,10 @@ def _decode_block(
 
 @kernel
 def _decode_gray(
-    addresses: Any, sample: Any, n_px: int, bits: int, mode: int, decision: Any, maps: Any
+    addresses: Any, wide: Any, n_px: int, bits: int, mode: int, decision: Any, maps: Any
 ) -> None:
     for block in numba.prange((n_px + _BLOCK - 1) // _BLOCK):
-        _decode_block(addresses, sample, n_px, block * _BLOCK, bits, mode, decision, maps)
+        _decode_block(addresses, wide, n_px, block * _BLOCK, bits, mode, decision, maps)
 
 
 class DistinctPixels(NamedTuple):
@@ -450,7 +468,6 @@ def distinct_projector_pixels(
 
 
 def warm_up_kernels() -> None:
-    """Compile this module's kernels for the types of frames there are, see `warm_up`."""
-    for dtype in (np.uint8, np.uint16):
-        frame = np.zeros((1, 1), dtype)
-        decode_gray_code([frame], [frame], codes=2, size_px=2)
+    """Compile this module's kernels, see `warm_up`."""
+    frame = np.zeros((1, 1), np.uint8)
+    decode_gray_code([frame], [frame], codes=2, size_px=2)

@@ -103,11 +103,16 @@ def _pointer(typingctx, address):  # noqa: ANN001, ANN202
 
 @no_type_check
 @numba.njit(inline="always")
-def frame_part(address, start, length, sample):  # noqa: ANN001, ANN201
-    """View `length` pixels from pixel `start` on of the frame at `address`; `sample` has its type."""
-    return numba.carray(
-        _pointer(np.uintp(address + start * sample.itemsize)), (length,), sample.dtype
-    )
+def narrow_part(address, start, length):  # noqa: ANN001, ANN201
+    """View `length` pixels from pixel `start` on of the uint8 frame at `address`."""
+    return numba.carray(_pointer(np.uintp(address + start)), (length,), np.uint8)
+
+
+@no_type_check
+@numba.njit(inline="always")
+def wide_part(address, start, length):  # noqa: ANN001, ANN201
+    """View `length` pixels from pixel `start` on of the uint16 frame at `address`."""
+    return numba.carray(_pointer(np.uintp(address + 2 * start)), (length,), np.uint16)
 
 
 class FrameStack(NamedTuple):
@@ -115,8 +120,8 @@ class FrameStack(NamedTuple):
 
     addresses: UInt[np.ndarray, "n_frames"]
     """Address of each frame's first pixel."""
-    sample: UInt[np.ndarray, "1"]
-    """An array of the frames' type, writable even where frames are not: one compiled kernel each."""
+    wide: bool
+    """The frames are uint16, not uint8. Kernels take this at run time: one compilation serves both."""
     shape: tuple[int, int]
     """Height and width of the frames."""
     frames: tuple[Shaped[np.ndarray, "h w"], ...]
@@ -162,8 +167,8 @@ def frame_stack(frames: Sequence[Shaped[np.ndarray, "..."]]) -> FrameStack:
             )
     held = tuple(np.require(frame, requirements=["C", "A"]) for frame in frames)
     addresses = np.array([frame.ctypes.data for frame in held], dtype=np.uintp)
-    sample = np.zeros(1, first.dtype)
-    return FrameStack(addresses=addresses, sample=sample, shape=first.shape, frames=held)
+    wide = first.dtype == np.uint16
+    return FrameStack(addresses=addresses, wide=wide, shape=first.shape, frames=held)
 
 
 class _Memory:

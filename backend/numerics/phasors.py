@@ -153,7 +153,7 @@ def fuse_exposures(
     )
     kernels.fuse_exposures(
         stack.addresses,
-        stack.sample,
+        stack.wide,
         shape[0] * shape[1],
         steps_of(code),
         kernels.Exposures(
@@ -279,7 +279,7 @@ def sinusoid_misfit(
     misfit_gray = np.empty(stack.shape, np.float32)
     kernels.sinusoid_misfit(
         stack.addresses,
-        stack.sample,
+        stack.wide,
         misfit_gray.size,
         steps_of(code),
         np.stack([np.cos(shifts), np.sin(shifts)]).astype(np.float32),
@@ -290,10 +290,9 @@ def sinusoid_misfit(
 
 
 def warm_up_kernels() -> None:
-    """Compile this module's kernels for the types of frames there are, see `warm_up`."""
+    """Compile this module's kernels, see `warm_up`."""
     code = SineCode.equal_steps((1,), 4)
-    for dtype in (np.uint8, np.uint16):
-        frames = [np.zeros((1, 1), dtype)] * 4
-        noise = NoiseModel(read_gray=1.0, gray_per_e=0.0)
-        fuse_exposures([frames], code, exposure_ms=[1.0], noise=noise, saturation_gray=255.0)
-        sinusoid_misfit(frames, code)
+    frames = [np.zeros((1, 1), np.uint8)] * 4
+    noise = NoiseModel(read_gray=1.0, gray_per_e=0.0)
+    fuse_exposures([frames], code, exposure_ms=[1.0], noise=noise, saturation_gray=255.0)
+    sinusoid_misfit(frames, code)

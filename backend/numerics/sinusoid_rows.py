@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from backend.numerics.kernels import frame_part, row_loop
+from backend.numerics.kernels import narrow_part, row_loop, wide_part
 
 TILE = 2048
 """Pixels per tile; some 30 rows of them stay in the second-level cache."""
@@ -149,7 +149,7 @@ def _add_four(
 @row_loop
 def _keep_peak(frame: Any, peak: Any) -> None:
     for i in range(frame.size):
-        gray = frame[i]
+        gray = np.uint16(frame[i])
         old = peak[i]
         peak[i] = gray if gray > old else old
 
@@ -160,7 +160,7 @@ def _keep_peak_of_four(frame_0: Any, frame_1: Any, frame_2: Any, frame_3: Any, p
         g0, g1, g2, g3 = frame_0[i], frame_1[i], frame_2[i], frame_3[i]
         a = g0 if g0 > g1 else g1
         b = g2 if g2 > g3 else g3
-        c = a if a > b else b
+        c = np.uint16(a if a > b else b)
         old = peak[i]
         peak[i] = c if c > old else old
 
@@ -173,9 +173,36 @@ def count_saturated(frame: Any, saturation: Any, count: Any) -> None:
 
 
 @row_loop
+def _add_four_frames(
+    addresses: Any,
+    wide: Any,
+    start: Any,
+    n: Any,
+    weights: Any,
+    frame: Any,
+    cosine: Any,
+    sine: Any,
+    mean: Any,
+    peak: Any,
+) -> None:
+    first, second = addresses[frame], addresses[frame + 1]
+    third, fourth = addresses[frame + 2], addresses[frame + 3]
+    if wide:
+        p, q = wide_part(first, start, n), wide_part(second, start, n)
+        r, s = wide_part(third, start, n), wide_part(fourth, start, n)
+        _add_four(p, q, r, s, weights, frame, cosine, sine, mean)
+        _keep_peak_of_four(p, q, r, s, peak)
+    else:
+        a, b = narrow_part(first, start, n), narrow_part(second, start, n)
+        c, d = narrow_part(third, start, n), narrow_part(fourth, start, n)
+        _add_four(a, b, c, d, weights, frame, cosine, sine, mean)
+        _keep_peak_of_four(a, b, c, d, peak)
+
+
+@row_loop
 def demodulate(
     addresses: Any,
-    sample: Any,
+    wide: Any,
     start: Any,
     n: Any,
     steps: Any,
@@ -198,18 +225,20 @@ def demodulate(
         fill(sine_k, ZERO)
         frame, end = steps.first_frame[k], steps.first_frame[k + 1]
         while frame + 4 <= end:
-            a = frame_part(addresses[frame], start, n, sample)
-            b = frame_part(addresses[frame + 1], start, n, sample)
-            c = frame_part(addresses[frame + 2], start, n, sample)
-            d = frame_part(addresses[frame + 3], start, n, sample)
-            _add_four(a, b, c, d, weights, frame, cosine_k, sine_k, mean_k)
-            _keep_peak_of_four(a, b, c, d, peak)
+            _add_four_frames(
+                addresses, wide, start, n, weights, frame, cosine_k, sine_k, mean_k, peak
+            )
             frame += 4
         while frame < end:
-            a = frame_part(addresses[frame], start, n, sample)
             w_cosine, w_sine, w_mean = weights[0, frame], weights[1, frame], weights[2, frame]
-            _add_frame(a, w_cosine, w_sine, w_mean, cosine_k, sine_k, mean_k)
-            _keep_peak(a, peak)
+            if wide:
+                p = wide_part(addresses[frame], start, n)
+                _add_frame(p, w_cosine, w_sine, w_mean, cosine_k, sine_k, mean_k)
+                _keep_peak(p, peak)
+            else:
+                q = narrow_part(addresses[frame], start, n)
+                _add_frame(q, w_cosine, w_sine, w_mean, cosine_k, sine_k, mean_k)
+                _keep_peak(q, peak)
             frame += 1
 
 

@@ -12,7 +12,7 @@ MODULES = (
 
 
 def warm_up() -> None:
-    """Run every kernel once on tiny arrays, for uint8 and uint16 frames.
+    """Run every kernel once on tiny arrays; one compilation serves uint8 and uint16 frames.
 
     Takes minutes where nothing is compiled yet, a second or two from the cache; call it in a thread
     of its own: kernels release the GIL.
