@@ -44,12 +44,12 @@ class FringePhaseParams(Params):
     )
     """By how much the frequencies may disagree. Automatic: 0.7 of what mixes up two fringe orders."""
     residual_sigmas: float = setting(
-        5.0, title="Contradiction over noise", unit="sigma", ge=0, le=100, advanced=True
+        6.0, title="Contradiction over noise", unit="sigma", ge=0, le=100, advanced=True
     )
     """Also reject where the frequencies disagree by more than so many times the pixel's predicted noise
     (a second reflection); 0 switches this off."""
     residual_floor_cycles: float = setting(
-        0.006, title="Contradiction always allowed", unit="cycles", ge=0, le=0.5, advanced=True
+        0.015, title="Contradiction always allowed", unit="cycles", ge=0, le=0.5, advanced=True
     )
     """What gamma, harmonics and calibration may add to the noise."""
     guard_band: float = setting(0.002, title="Guard band", ge=0, le=0.2, advanced=True)
