@@ -98,7 +98,9 @@ def view(
     depth = surface(eye.t_mm, directions @ eye.R.T)
     world = eye.t_mm + depth[:, None] * (directions @ eye.R.T)
     uv = project(world, light, light_pose)
-    lit = (uv >= 0).all(axis=1) & (uv[:, 0] <= light.width_px - 1) & (uv[:, 1] <= light.height_px - 1)
+    lit = (
+        (uv >= 0).all(axis=1) & (uv[:, 0] <= light.width_px - 1) & (uv[:, 1] <= light.height_px - 1)
+    )
     lit &= ~hidden(surface, world, inverse(light_pose).t_mm)
     uv[~lit] = np.nan
     points = np.where(lit[:, None], directions * depth[:, None], np.nan)
@@ -111,7 +113,11 @@ def hidden(surface: Surface, world_mm: np.ndarray, eye_mm: np.ndarray) -> np.nda
 
 
 def seen_by_other(
-    surface: Surface, reference: View, pose: RigidTransform, other: Pinhole, other_pose: RigidTransform
+    surface: Surface,
+    reference: View,
+    pose: RigidTransform,
+    other: Pinhole,
+    other_pose: RigidTransform,
 ) -> np.ndarray:
     """Tell which reference pixels show a lit point that the other camera sees, not at its border."""
     points = reference.points_mm.reshape(-1, 3)
@@ -120,4 +126,6 @@ def seen_by_other(
     size = np.array([other.width_px, other.height_px])
     inside = ((pixels >= 1) & (pixels <= size - 2)).all(axis=1)
     world = points @ eye.R.T + eye.t_mm
-    return (inside & ~hidden(surface, world, inverse(other_pose).t_mm)).reshape(reference.u_px.shape)
+    return (inside & ~hidden(surface, world, inverse(other_pose).t_mm)).reshape(
+        reference.u_px.shape
+    )

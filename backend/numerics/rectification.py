@@ -140,8 +140,9 @@ def _common_frame(other_from_reference: RigidTransform) -> tuple[Float[np.ndarra
 
 
 def _border(camera: Pinhole, turn: Float[np.ndarray, "3 3"], name: str) -> Float[np.ndarray, "n 2"]:
-    """Return the rectified slopes of all border pixels."""
-    x, y = np.arange(camera.width_px), np.arange(camera.height_px)
+    """Return the rectified slopes along the border, every fourth pixel: the canvas has a margin of 1 px."""
+    x = np.append(np.arange(0, camera.width_px - 1, 4), camera.width_px - 1)
+    y = np.append(np.arange(0, camera.height_px - 1, 4), camera.height_px - 1)
     top, left = np.zeros_like(x), np.zeros_like(y)
     edges = [(x, top), (x, top + camera.height_px - 1), (left, y), (left + camera.width_px - 1, y)]
     pixels = np.concatenate([np.stack(edge, axis=1) for edge in edges]).astype(np.float64)

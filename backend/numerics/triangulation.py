@@ -28,8 +28,8 @@ class Cloud(NamedTuple):
     """Standard deviation of the point along its pixel's ray; NaN if the coordinate's noise isn't known."""
 
 
-_NEWTON_STEPS = 2
-"""A lens that moves a point by 5 px is corrected to 0.003 px by the first step, to 1e-9 px by the second."""
+_NEWTON_STEPS = 3
+"""A lens that moves a point by 5 px is corrected to 0.003 px by the first step; a strong one (k1 = -0.25) needs all three."""
 
 
 def triangulate_pair(matches: Matches, rectification: Rectification) -> Cloud:
@@ -107,7 +107,7 @@ def triangulate_projector(
 
     .. math:: \lambda = \frac{(u - c) t_z - f t_x}{f X_x - (u - c) X_z}
 
-    With projector distortion the plane is a curved surface; the depth is corrected by two
+    With projector distortion the plane is a curved surface; the depth is corrected by three
     Newton steps on the distorted projection, which for a real lens leaves less than 1e-6 px.
     sigma is :math:`\sigma_u |\partial \lambda / \partial u| |r|`.
     """
@@ -312,16 +312,29 @@ def _bent(px: Any, py: Any, c: Any) -> Any:
 
 
 @row_loop
+def _scalars(c: Any) -> Any:
+    return (
+        c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], c[11], c[12], c[13], c[14],
+    )  # fmt: skip
+
+
+@row_loop
 def _newton(x: Any, y: Any, u: Any, R: Any, t: Any, c: Any, depth: Any, per_px: Any) -> Any:
     """Move each depth by one Newton step of the distorted projection."""
+    # Read before the loop: an array that might overlap the written one keeps the loop scalar.
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    t0, t1, t2 = t[0], t[1], t[2]
+    lens = _scalars(c)
     for i in range(x.size):
-        rx = R[0, 0] * x[i] + R[0, 1] * y[i] + R[0, 2]
-        ry = R[1, 0] * x[i] + R[1, 1] * y[i] + R[1, 2]
-        rz = R[2, 0] * x[i] + R[2, 1] * y[i] + R[2, 2]
-        scale = 1.0 / (depth[i] * rz + t[2])
-        px = (depth[i] * rx + t[0]) * scale
-        py = (depth[i] * ry + t[1]) * scale
-        value, du_dx, du_dy = _bent(px, py, c)
+        rx = r00 * x[i] + r01 * y[i] + r02
+        ry = r10 * x[i] + r11 * y[i] + r12
+        rz = r20 * x[i] + r21 * y[i] + r22
+        scale = 1.0 / (depth[i] * rz + t2)
+        px = (depth[i] * rx + t0) * scale
+        py = (depth[i] * ry + t1) * scale
+        value, du_dx, du_dy = _bent(px, py, lens)
         per_mm = (du_dx * (rx - px * rz) + du_dy * (ry - py * rz)) * scale
         inverse = 1.0 / per_mm
         z = depth[i] + (u[i] - value) * inverse
@@ -378,13 +391,18 @@ def _plane_rows(
 
 @row_loop
 def _residual_row(points: Any, u: Any, R: Any, t: Any, c: Any, out: Any) -> Any:
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    t0, t1, t2 = t[0], t[1], t[2]
+    lens = _scalars(c)
     for i in range(u.size):
         X, Y, Z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        distance = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * Z + t[2]
+        distance = r20 * X + r21 * Y + r22 * Z + t2
         scale = 1.0 / distance
-        px = (R[0, 0] * X + R[0, 1] * Y + R[0, 2] * Z + t[0]) * scale
-        py = (R[1, 0] * X + R[1, 1] * Y + R[1, 2] * Z + t[1]) * scale
-        value, _, _ = _bent(px, py, c)
+        px = (r00 * X + r01 * Y + r02 * Z + t0) * scale
+        py = (r10 * X + r11 * Y + r12 * Z + t1) * scale
+        value, _, _ = _bent(px, py, lens)
         out[i] = value - u[i] if distance > 0.0 else np.nan
 
 

@@ -80,7 +80,11 @@ def test_unusable_cameras_are_refused_by_name(changed: Pinhole, message: str):
 
 @pytest.mark.parametrize(
     ("R", "message"),
-    [(np.ones((3, 3)), "isn't a rotation"), (np.full((3, 3), np.nan), "isn't a rotation"), (np.diag([1.0, 1, -1]), "mirrors")],
+    [
+        (np.ones((3, 3)), "isn't a rotation"),
+        (np.full((3, 3), np.nan), "isn't a rotation"),
+        (np.diag([1.0, 1, -1]), "mirrors"),
+    ],
 )
 def test_unusable_poses_are_refused(R, message):
     with pytest.raises(CalibrationError, match=message):

@@ -19,7 +19,9 @@ def test_dark_level_ignores_hot_pixels():
 
 
 def test_dark_level_of_a_noiseless_camera_is_limited_by_rounding():
-    assert dark_level(np.full((8, 8), 3, np.uint8)).limit_gray == pytest.approx(3 + 3 * 0.2887, abs=1e-3)
+    assert dark_level(np.full((8, 8), 3, np.uint8)).limit_gray == pytest.approx(
+        3 + 3 * 0.2887, abs=1e-3
+    )
 
 
 def test_cameras_are_pooled_without_their_own_background():
@@ -62,9 +64,7 @@ def test_smoothing_keeps_pixels_at_the_ends():
     assert smoothed(counts).sum() == pytest.approx(20)
 
 
-@pytest.mark.parametrize(
-    ("levels", "message"), [([], "is empty"), ([77], "same gray level 77")]
-)
+@pytest.mark.parametrize(("levels", "message"), [([], "is empty"), ([77], "same gray level 77")])
 def test_range_needs_two_levels(levels, message):
     counts = np.zeros(256)
     counts[levels] = 5

@@ -9,7 +9,17 @@ from backend.numerics.matching import match, sample_partner
 from backend.numerics.reasons import Reason
 from backend.numerics.rectification import rectify
 from backend.numerics.triangulation import triangulate_pair
-from tests.surfaces import LEFT, RIGHT, camera, looking_from, plane, seen_by_other, sphere, step, view
+from tests.surfaces import (
+    LEFT,
+    RIGHT,
+    camera,
+    looking_from,
+    plane,
+    seen_by_other,
+    sphere,
+    step,
+    view,
+)
 
 WIDTH, HEIGHT, SHIFT = 64, 24, 6
 _K = np.array([[100.0, 0, 31.5], [0, 100.0, 11.5], [0, 0, 1]])
@@ -32,7 +42,11 @@ def columns(matches):
     return matches.x_other_px + 31.5
 
 
-@given(scale=st.sampled_from([1.25, 0.4, 3.0, -1.25, -0.3]), shift=st.floats(0, 20), offset=st.floats(-50, 900))
+@given(
+    scale=st.sampled_from([1.25, 0.4, 3.0, -1.25, -0.3]),
+    shift=st.floats(0, 20),
+    offset=st.floats(-50, 900),
+)
 @settings(max_examples=40, deadline=None)
 def test_sub_pixel_shift_of_a_ramp_of_either_slope(scale, shift, offset):
     x = np.arange(WIDTH)
@@ -54,7 +68,7 @@ def test_pixels_without_coordinate_have_neither_partner_nor_reason():
 
 def test_outside_the_other_camera_there_is_no_match():
     matches = match(RAMP, SHIFTED, ASIDE)
-    assert (matches.reasons[1:-1, : SHIFT] == Reason.NO_MATCH).all()
+    assert (matches.reasons[1:-1, :SHIFT] == Reason.NO_MATCH).all()
     assert (matches.reasons[1:-1, SHIFT + 1 : -2] == 0).all()
 
 
@@ -104,7 +118,9 @@ def test_either_camera_may_be_the_reference(surface, swap):
     found = np.isfinite(error)
     assert (found & seen).sum() > 0.97 * seen.sum()
     assert not found[np.isfinite(here.u_px) & ~seen].sum() > 0.02 * seen.sum()
-    if surface is not sphere:  # straight lines are interpolated exactly, up to the lens and perspective
+    if (
+        surface is not sphere
+    ):  # straight lines are interpolated exactly, up to the lens and perspective
         assert np.nanmax(error) < 2e-3
 
 
@@ -114,7 +130,9 @@ def test_cameras_mounted_on_their_side_and_of_different_size():
     a, b = looking_from(-90, 0, roll_rad=np.pi / 2), looking_from(90, 0, roll_rad=-np.pi / 2 + 0.1)
     here, there = view(plane, upright, a), view(plane, tilted, b)
     pair = rectify(upright, tilted, compose(b, inverse(a)))
-    cloud = triangulate_pair(match(here.u_px.astype(np.float32), there.u_px.astype(np.float32), pair), pair)
+    cloud = triangulate_pair(
+        match(here.u_px.astype(np.float32), there.u_px.astype(np.float32), pair), pair
+    )
     error = np.linalg.norm(cloud.points_mm - here.points_mm, axis=2)
     seen = seen_by_other(plane, here, a, tilted, b)
     assert np.isfinite(error)[seen].mean() > 0.98

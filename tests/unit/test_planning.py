@@ -165,9 +165,7 @@ def test_more_time_never_hurts_and_a_step_lowers_the_cost_by_its_gain():
     assert costs == sorted(costs, reverse=True)
     plan = plan_exposures(SCENE, NOISE, DLP, budget_s=10.0)
     assert np.isnan(plan.gain[0])
-    assert plan.gain[1] == pytest.approx(
-        1 - plan.by_count[1].cost / plan.by_count[0].cost
-    )
+    assert plan.gain[1] == pytest.approx(1 - plan.by_count[1].cost / plan.by_count[0].cost)
 
 
 @given(budget_s=st.floats(0.5, 60), seed=st.integers(0, 50), most=st.integers(1, 4))

@@ -44,7 +44,9 @@ def test_nothing_that_both_cameras_see_is_lost_and_partners_share_a_row(
     pixels = rng.uniform(0, 1, (4000, 2)) * [first.width_px - 1, first.height_px - 1]
     pixels[:400, 0] = rng.choice([0, first.width_px - 1], 400)  # the borders above all
     slopes = rays(pixels, first)
-    points = np.column_stack([slopes, np.ones(4000)]) * rng.uniform(0.5 * target, 2 * target, (4000, 1))
+    points = np.column_stack([slopes, np.ones(4000)]) * rng.uniform(
+        0.5 * target, 2 * target, (4000, 1)
+    )
     seen = project(points, second, other_from_reference)
     both = ((seen >= 0) & (seen <= [second.width_px - 1, second.height_px - 1])).all(axis=1)
     here = RigidTransform(np.eye(3), np.zeros(3))
@@ -83,7 +85,9 @@ def test_wide_convergence_gets_a_coarser_canvas_not_a_larger_one():
     def rig(x_mm):
         return looking_from(x_mm, 0, target_mm=200)
 
-    wide = camera(640, 480, lens=())._replace(K=np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]))
+    wide = camera(640, 480, lens=())._replace(
+        K=np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
+    )
     pair = rectify(wide, wide, compose(rig(150), inverse(rig(-150))))
     for canvas in (pair.reference, pair.other):
         assert canvas.width_px * canvas.height_px < 4.1 * 640 * 480
@@ -95,7 +99,10 @@ def test_wide_convergence_gets_a_coarser_canvas_not_a_larger_one():
     [
         (RigidTransform(np.eye(3), np.zeros(3)), "stand 0 mm apart"),
         (RigidTransform(np.eye(3), np.array([0.0, 0.0, -80.0])), "look along the line"),
-        (RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.array([80.0, 0, 0])), "look along the line|80 deg"),
+        (
+            RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.array([80.0, 0, 0])),
+            "look along the line|80 deg",
+        ),
         (RigidTransform(np.eye(3), np.array([np.nan, 0.0, 0.0])), "finite translation"),
     ],
 )

@@ -136,7 +136,10 @@ def test_scene_without_contrast_is_refused(levels, message):
         find_zones(counts)
 
 
-@given(st.lists(st.integers(3, 255), min_size=2, max_size=300), st.sampled_from(["gaussian", "polynomial"]))
+@given(
+    st.lists(st.integers(3, 255), min_size=2, max_size=300),
+    st.sampled_from(["gaussian", "polynomial"]),
+)
 @settings(max_examples=100, deadline=None)
 def test_any_histogram_of_two_levels_or_more_has_ordered_zones(levels, fit):
     counts = np.bincount(levels, minlength=256).astype(float)
