@@ -48,7 +48,8 @@ class JobControl:
         self._on_stop: list[Callable[[], None]] = []
         self._live = Live()
         self._stage_began = clock()
-        self._told = -REPORT_PERIOD_S
+        self._told = clock() - REPORT_PERIOD_S
+        self._later: threading.Timer | None = None
         self.stopped_by: str | None = None
         """Who cancelled; None while nobody did, or when the application shuts down."""
 
@@ -125,8 +126,21 @@ class JobControl:
         self._tell(replace(self._live, progress=share, text=text, remaining_s=remaining_s))
 
     def _tell(self, live: Live, *, now: bool = False) -> None:
-        self._live = live
-        moment = self._clock()
-        if now or moment - self._told >= REPORT_PERIOD_S:
-            self._told = moment
-            self._publish(live)
+        """Publish now, or, if that was done a moment ago, in a moment: the last word before a silence counts."""
+        with self._lock:
+            self._live = live
+            wait_s = self._told + REPORT_PERIOD_S - self._clock()
+            if wait_s > 0 and not now:
+                if self._later is None:
+                    self._later = threading.Timer(wait_s, self._tell_late)
+                    self._later.daemon = True
+                    self._later.start()
+                return
+            self._told = self._clock()
+        self._publish(live)
+
+    def _tell_late(self) -> None:
+        with self._lock:
+            self._later = None
+            self._told = self._clock()
+        self._publish(self._live)

@@ -22,7 +22,7 @@ def render(
     width_px: int,
     height_px: int,
     gamma: float = 1.0,
-    mask: Float[np.ndarray, "h w"] | None = None,
+    mask: Float[np.ndarray, "mask_h mask_w"] | None = None,
 ) -> UInt8[np.ndarray, "h w"]:
     """Render a pattern for a projector.
 
@@ -50,7 +50,7 @@ def render(
 
 
 def _dim(
-    picture: UInt8[np.ndarray, "h w"], mask: Float[np.ndarray, "h w"], gamma: float
+    picture: UInt8[np.ndarray, "h w"], mask: Float[np.ndarray, "mask_h mask_w"], gamma: float
 ) -> UInt8[np.ndarray, "h w"]:
     if mask.shape != picture.shape:
         raise StageFailedError(

@@ -4,20 +4,17 @@ import contextlib
 from collections.abc import Iterator
 
 import pytest
-from sqlalchemy import event
 
 from backend.storage.artifacts import LocalArtifactStore
 from backend.storage.database import Database
-from tests.scans.toy_house import House, inline_house
+from tests.scans.toy_house import House, hurry, inline_house
 
 
 @pytest.fixture
 def sqlite_database(sqlite_url: str) -> Iterator[Database]:
     """Open a fresh SQLite database that doesn't wait for the disk: nobody pulls the plug here."""
     with contextlib.closing(Database(sqlite_url)) as opened:
-        event.listen(
-            opened.engine, "connect", lambda c, _: c.execute("PRAGMA synchronous = OFF")
-        )
+        hurry(opened)
         yield opened
 
 

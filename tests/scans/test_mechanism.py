@@ -1,6 +1,7 @@
 """Keys, invalidation, edits, undo, takes, decisions: the mechanism, on the toy method."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -172,7 +173,7 @@ def test_settings_are_stored_as_they_are_not_as_they_were_written(house: House) 
     ],
 )  # fmt: skip
 def test_a_setting_that_cant_be_used_is_refused_in_one_sentence(
-    house: House, stage_name: str, changes: dict[str, object], sentence: str
+    house: House, stage_name: str, changes: dict[str, Any], sentence: str
 ) -> None:
     state = house.create()
     with pytest.raises(InvalidSettingError, match=f"^{sentence}$"):
@@ -191,7 +192,7 @@ def test_a_setting_that_cant_be_used_is_refused_in_one_sentence(
     ],
 )  # fmt: skip
 def test_a_scan_that_cant_be_made_says_what_there_is(
-    house: House, options: dict[str, object], error: type[Exception], sentence: str
+    house: House, options: dict[str, Any], error: type[Exception], sentence: str
 ) -> None:
     with pytest.raises(error, match=sentence):
         house.create(**options)
@@ -263,7 +264,12 @@ def test_redo_takes_new_pictures_of_one_stage(house: House) -> None:
     shots = house.rigs.shots
     redone = house.redo(state, "toy_fringes")
     assert stage(redone, "toy_fringes").take == 2
-    assert statuses(redone) == {**DONE, "fringes": "pending", "phase": "pending", "cloud": "pending"}
+    assert statuses(redone) == {
+        **DONE,
+        "fringes": "pending",
+        "phase": "pending",
+        "cloud": "pending",
+    }
     after = house.run_through(state.id)
     assert house.rigs.shots == shots + 8
     assert hashes(after)["fringes"] != hashes(state)["fringes"]
@@ -342,7 +348,10 @@ def test_a_rejected_result_stops_every_run_until_something_changes(house: House)
     request = Decide(verdict=Verdict.REJECT, reason="too noisy")
     state = house.services.decide(gate.stage_run, request, "bob")
     assert statuses(state)["phase"] == "rejected"
-    assert stage(state, "toy_phase").message == "Rejected by bob: too noisy. Change a setting or redo it."
+    assert (
+        stage(state, "toy_phase").message
+        == "Rejected by bob: too noisy. Change a setting or redo it."
+    )
     for unattended in (False, True):
         with pytest.raises(ConflictError, match="bob rejected Phase: change a setting or redo it"):
             house.run(state.id, unattended=unattended)
@@ -380,11 +389,17 @@ GATES = [
 
 
 @pytest.mark.parametrize(("most", "unattended", "levels", "job", "phase"), GATES)
-def test_gates(house: House, most: float, unattended: bool, levels: str, job: str, phase: str) -> None:
+def test_gates(
+    house: House, most: float, unattended: bool, levels: str, job: str, phase: str
+) -> None:
     scan = house.create(settings={"toy_levels": {"most": most}}).id
     state = house.run(scan, unattended=unattended)
     assert state.job is not None
-    assert (statuses(state)["levels"], statuses(state)["phase"], state.job.status) == (levels, phase, job)
+    assert (statuses(state)["levels"], statuses(state)["phase"], state.job.status) == (
+        levels,
+        phase,
+        job,
+    )
 
 
 def test_a_failed_check_stops_an_unattended_run(house: House) -> None:
@@ -426,7 +441,9 @@ def test_without_calibration_only_the_last_stage_is_unavailable(house: House) ->
     message = "Unavailable: needs RigCalibration, and the rig hands over none."
     assert stage(state, "toy_cloud").message == message
     assert state.status == "done"
-    with pytest.raises(StageUnavailableError, match="toy_cloud is unavailable: needs RigCalibration"):
+    with pytest.raises(
+        StageUnavailableError, match="toy_cloud is unavailable: needs RigCalibration"
+    ):
         house.run(state.id, until="toy_cloud")
 
 
@@ -434,7 +451,10 @@ def test_every_action_is_in_the_audit_trail(house: House) -> None:
     state = house.create(who="ada")
     state = house.edit(state, "toy_levels", who="bob", step_gray=32)
     house.services.edit(
-        state.id, "toy_levels", EditSettings(changes={"step_gray": 16}, revision=1, reason="finer"), "bob"
+        state.id,
+        "toy_levels",
+        EditSettings(changes={"step_gray": 16}, revision=1, reason="finer"),
+        "bob",
     )
     state = house.undo(house.services.scan(state.id), who="cid")
     house.services.redo(state.id, "toy_look", RedoStage(revision=state.revision), "dan")

@@ -28,11 +28,28 @@ from backend.devices.protocols import Frame as DeviceFrame
 from backend.domain.checks import Check, at_most
 from backend.domain.errors import RigFailedError, StageFailedError
 from backend.domain.frames import Frame
-from backend.domain.hints import Curve, Frames, Histogram, Mask, Picture, Points, Scalar, Table, Value
+from backend.domain.hints import (
+    Curve,
+    Frames,
+    Histogram,
+    Mask,
+    Picture,
+    Points,
+    Scalar,
+    Table,
+    Value,
+)
 from backend.domain.method import Method
 from backend.domain.params import Params, setting
 from backend.domain.patterns import WHITE, Sine
-from backend.domain.rig import CameraFacts, PinholeModel, Pose, ProjectorFacts, RigCalibration, RigFacts
+from backend.domain.rig import (
+    CameraFacts,
+    PinholeModel,
+    Pose,
+    ProjectorFacts,
+    RigCalibration,
+    RigFacts,
+)
 from backend.domain.shots import Burst, Exposed, Plan, Progress, Shoot, Shot, Until
 from backend.domain.stage import stage
 from backend.domain.states import Review
@@ -74,7 +91,12 @@ class Look:
 def bright_enough(result: Look, params: LookParams) -> Check:
     last = result.ladder[-1].mean_gray
     return at_most(
-        "brightness", last, warning=200.0, failure=240.0, sentence=f"mean gray {last:.0f}", unit="gray"
+        "brightness",
+        last,
+        warning=200.0,
+        failure=240.0,
+        sentence=f"mean gray {last:.0f}",
+        unit="gray",
     )
 
 
@@ -119,7 +141,8 @@ class Levels:
 
     levels_gray: Float[np.ndarray, "n"]
     histogram: Annotated[
-        Float[np.ndarray, "gray"], Histogram("Gray levels", valleys="levels_gray", edits="levels_gray")
+        Float[np.ndarray, "gray"],
+        Histogram("Gray levels", valleys="levels_gray", edits="levels_gray"),
     ]
     count: Annotated[int, Value("Levels")]
     labels: Annotated[UInt8[np.ndarray, "h w"], Mask("Levels", {1: "dark"}, edits="mask")]
@@ -154,7 +177,9 @@ class Hint:
 class FringesParams(Params):
     """How the fringes are captured."""
 
-    exposures_ms: tuple[float, ...] = setting((2.0, 4.0), title="Exposures", min_length=1, max_length=8)
+    exposures_ms: tuple[float, ...] = setting(
+        (2.0, 4.0), title="Exposures", min_length=1, max_length=8
+    )
     steps: int = setting(4, title="Steps", ge=3, le=16)
     until: bool = setting(False, title="Wait for a bright picture first")
 
@@ -204,8 +229,8 @@ class PhaseParams(Params):
     """How the phase is calculated, and how it goes wrong."""
 
     offset_rad: float = setting(0.0, title="Offset", unit="rad", ge=-4, le=4)
-    behave: Literal["well", "numerics", "sentence", "defect", "memory", "report", "hang", "die"] = setting(
-        "well", title="Behaviour"
+    behave: Literal["well", "numerics", "sentence", "defect", "memory", "report", "hang", "die"] = (
+        setting("well", title="Behaviour")
     )
 
 
@@ -213,7 +238,9 @@ class PhaseParams(Params):
 class ToyPhase:
     """Phase per camera."""
 
-    phase_rad: Annotated[Mapping[str, Float[np.ndarray, "h w"]], Picture("Phase", unit="rad", colormap="twilight")]
+    phase_rad: Annotated[
+        Mapping[str, Float[np.ndarray, "h w"]], Picture("Phase", unit="rad", colormap="twilight")
+    ]
     mean_rad: Annotated[float, Value("Mean", unit="rad")]
     x_px: Float[np.ndarray, "w"]
     profile_rad: Annotated[Float[np.ndarray, "w"], Curve("Profile", x="x_px")]
@@ -272,7 +299,9 @@ class CloudParams(Params):
 class Cloud:
     """Points."""
 
-    points_mm: Annotated[Float[np.ndarray, "n 3"], Points("Cloud", colour="rgb", scalars=("height_mm",))]
+    points_mm: Annotated[
+        Float[np.ndarray, "n 3"], Points("Cloud", colour="rgb", scalars=("height_mm",))
+    ]
     rgb: UInt8[np.ndarray, "n 3"]
     height_mm: Annotated[Float[np.ndarray, "n"], Scalar("Height", unit="mm")]
     pixel_x: Float[np.ndarray, "n"]
@@ -304,6 +333,18 @@ def toy_registry() -> Registry:
 
 
 # the rig
+
+BEFORE = CameraSettings(1000.0, 0.0, "Mono8")
+CAMERA = DeviceInfo("toy", "camera", "1")
+ABILITIES = CameraCapabilities(
+    (WIDTH_PX, HEIGHT_PX),
+    ("Mono8",),
+    Range(10.0, 100_000.0, 0.0, "us"),
+    Range(0.0, 10.0, 0.0, "dB"),
+    (TriggerSource.SOFTWARE,),
+)
+PROJECTOR = DeviceInfo("toy", "projector", "2")
+DISPLAY = ProjectorCapabilities(PROJECTOR_PX)
 
 
 @dataclass
@@ -345,15 +386,9 @@ class ToyCamera(Closing):
     name: str
     rig: "ToyRig"
     state: LinkState = LinkState.CLOSED
-    settings: CameraSettings = CameraSettings(1000.0, 0.0, "Mono8")
-    info: DeviceInfo = DeviceInfo("toy", "camera", "1")
-    capabilities: CameraCapabilities = CameraCapabilities(
-        (WIDTH_PX, HEIGHT_PX),
-        ("Mono8",),
-        Range(10.0, 100_000.0, 0.0, "us"),
-        Range(0.0, 10.0, 0.0, "dB"),
-        (TriggerSource.SOFTWARE,),
-    )
+    settings: CameraSettings = BEFORE
+    info: DeviceInfo = CAMERA
+    capabilities: CameraCapabilities = ABILITIES
     frames: int = 0
     exposing: bool = False
     aborted: threading.Event = field(default_factory=threading.Event)
@@ -411,8 +446,8 @@ class ToyProjector(Closing):
     rig: "ToyRig"
     name: str = "projector"
     state: LinkState = LinkState.CLOSED
-    info: DeviceInfo = DeviceInfo("toy", "projector", "2")
-    capabilities: ProjectorCapabilities = ProjectorCapabilities(PROJECTOR_PX)
+    info: DeviceInfo = PROJECTOR
+    capabilities: ProjectorCapabilities = DISPLAY
     loaded: tuple[np.ndarray, ...] = ()
     loads: int = 0
     picture: np.ndarray = field(default_factory=lambda: np.zeros(PROJECTOR_PX[::-1], np.uint8))
@@ -461,7 +496,9 @@ class ToyRig(Closing):
     def facts(self) -> RigFacts:
         camera = CameraFacts(WIDTH_PX, HEIGHT_PX, 8, 0.01, 100.0, 0.0, 10000.0, 5.0)
         width_px, height_px = PROJECTOR_PX
-        return RigFacts(dict.fromkeys(self.cameras, camera), "left", ProjectorFacts(width_px, height_px))
+        return RigFacts(
+            dict.fromkeys(self.cameras, camera), "left", ProjectorFacts(width_px, height_px)
+        )
 
     def calibration(self) -> RigCalibration | None:
         if not self.options.get("calibrated", True):
@@ -471,9 +508,13 @@ class ToyRig(Closing):
         return RigCalibration(dict.fromkeys(self.cameras, model), poses, "left")
 
     def seen_by(self, camera: ToyCamera) -> np.ndarray:
-        light = np.resize(self.projector.picture[0], WIDTH_PX) * camera.settings.exposure_us / 10_000
+        light = (
+            np.resize(self.projector.picture[0], WIDTH_PX) * camera.settings.exposure_us / 10_000
+        )
         rows = np.linspace(0.2, 1.0, HEIGHT_PX)[:, None]
-        noise = self._random.normal(0, 3, (HEIGHT_PX, WIDTH_PX)) if self.options.get("noise") else 0.0
+        noise = (
+            self._random.normal(0, 3, (HEIGHT_PX, WIDTH_PX)) if self.options.get("noise") else 0.0
+        )
         return np.clip(rows * light[None, :] + noise, 0, 255).astype(np.uint8)
 
 

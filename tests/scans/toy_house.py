@@ -6,8 +6,17 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import event
+
 from backend.contract.events import Event
-from backend.contract.requests import CreateScan, Decide, EditSettings, RedoStage, StartRun, UndoEdit
+from backend.contract.requests import (
+    CreateScan,
+    Decide,
+    EditSettings,
+    RedoStage,
+    StartRun,
+    UndoEdit,
+)
 from backend.contract.scans import ScanState, StageState
 from backend.domain.states import Verdict
 from backend.jobs.execution import Workshop
@@ -24,20 +33,24 @@ class House:
     """Services around the toys, with short words for what tests do all the time."""
 
     def __init__(
-        self, database: Database, store: LocalArtifactStore, make_runner: Callable[[Workshop], Runner]
+        self,
+        database: Database,
+        store: LocalArtifactStore,
+        make_runner: Callable[[Workshop], Runner],
     ) -> None:
         self.rigs = ToyRigs()
         self.events: list[Event] = []
+        self.watchers: list[Callable[[Event], None]] = []
         hub = EventHub()
 
         def publish(event: Event) -> None:
             self.events.append(event)
+            for look in self.watchers:
+                look(event)
             hub.publish(event)
 
         pool = RigPool(self.rigs, publish)
-        self.shop = Workshop(
-            database, store, pool, toy_registry, publish, {"unglare": "test"}
-        )
+        self.shop = Workshop(database, store, pool, toy_registry, publish, {"unglare": "test"})
         self.services = Services(
             database=database,
             store=store,
@@ -71,7 +84,13 @@ class House:
         return self.services.decide(stage.stage_run, request, who)
 
     def edit(
-        self, state: ScanState, stage: str, *, who: str = "ada", reset: tuple[str, ...] = (), **changes: Any
+        self,
+        state: ScanState,
+        stage: str,
+        *,
+        who: str = "ada",
+        reset: tuple[str, ...] = (),
+        **changes: Any,
     ) -> ScanState:
         request = EditSettings(changes=changes, reset=reset, revision=state.revision)
         return self.services.edit(state.id, stage, request, who)
@@ -115,6 +134,11 @@ def local_house(database: Database, store: LocalArtifactStore) -> Iterator[House
     house.services.close()
 
 
+def hurry(database: Database) -> None:
+    """Don't wait for the disk."""
+    event.listen(database.engine, "connect", lambda c, _: c.execute("PRAGMA synchronous = OFF"))
+
+
 class Gate:
     """Holds the rig before its n-th shot until the test lets it go on."""
 
@@ -131,7 +155,8 @@ class Gate:
 
 
 def data_folder(path: Path) -> tuple[Database, LocalArtifactStore]:
-    """Open (or make) database and store in a folder."""
+    """Open (or make) database and store in a folder, without waiting for the disk: processes die, not the power."""
     database = Database(f"sqlite:///{path / 'unglare.db'}")
+    hurry(database)
     database.upgrade()
     return database, LocalArtifactStore(path / "artifacts", durable=False)
