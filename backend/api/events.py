@@ -48,7 +48,7 @@ async def event_stream(
 ) -> EventStream:
     """Tell events as they come (`event: kind`, `data: JSON`); who may have missed some asks for the state."""
     context = context_of(request)
-    end = None if who.session is None else context.sessions.wait_for_end(who.session)
+    end = context.sessions.wait_for_end(who.session)
     lines = event_lines(context.services.events.subscribe(), scan, end)
     return EventStream(lines, headers={"X-Accel-Buffering": "no"})
 

@@ -134,6 +134,8 @@ class Sessions:
         self._attempts = attempts or Attempts()
         self._by_cookie: dict[bytes, Session] = {}
         self._by_station_token: dict[bytes, Session] = {}
+        self.closed = asyncio.Event()
+        """Set when the server stops: streams of callers without a session end then."""
 
     @property
     def lifetime_s(self) -> float:
@@ -200,12 +202,16 @@ class Sessions:
         self._by_station_token.pop(_digest(session.station_token), None)
 
     def end_all(self) -> None:
-        """End every session, as when the server stops."""
+        """End every session, because the server stops."""
+        self.closed.set()
         for session in list(self._by_cookie.values()):
             self.end(session)
 
-    async def wait_for_end(self, session: Session) -> None:
-        """Return when the session has ended, by logout or by the clock."""
+    async def wait_for_end(self, session: Session | None) -> None:
+        """Return when the session has ended, by logout or by the clock; without one, when the server stops."""
+        if session is None:
+            await self.closed.wait()
+            return
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(max(session.expires_s - self._clock(), 0.0)):
                 await session.ended.wait()
