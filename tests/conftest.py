@@ -41,10 +41,10 @@ def database_url(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(params=["sqlite", "postgres"])
-def empty_database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+def empty_database_url(request: pytest.FixtureRequest, fast_folder: Path) -> str:
     """Address of a fresh database without any tables; once per kind of database."""
     if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'empty.db'}"
+        return f"sqlite:///{fast_folder / 'empty.db'}"
     server = request.getfixturevalue("postgres_server")
     assert isinstance(server, PostgresServer)
     return server.new_database()
@@ -65,11 +65,18 @@ def sqlite_database(sqlite_url: str) -> Iterator[Database]:
 
 
 @pytest.fixture
-def sqlite_url(sqlite_template: Path, tmp_path: Path) -> str:
+def sqlite_url(sqlite_template: Path, fast_folder: Path) -> str:
     """Address of a fresh SQLite file whose tables are up to date."""
-    file = tmp_path / "unglare.db"
+    file = fast_folder / "unglare.db"
     shutil.copyfile(sqlite_template, file)
     return f"sqlite:///{file}"
+
+
+@pytest.fixture
+def fast_folder() -> Iterator[Path]:
+    """Folder for what is written and thrown away: in memory where the machine can."""
+    with tempfile.TemporaryDirectory(prefix="unglare-test-", dir=_memory()) as folder:
+        yield Path(folder)
 
 
 @pytest.fixture(scope="session")
@@ -189,11 +196,8 @@ class PostgresServer:
 
 @contextlib.contextmanager
 def _data_folder() -> Iterator[Path]:
-    # Not below pytest's folder: PostgreSQL's user may not enter it. In memory a database is copied
-    # 8 times faster than on a disk.
-    memory = Path("/dev/shm")
-    place = memory if memory.is_dir() and shutil.disk_usage(memory).free > 1 << 29 else None
-    folder = Path(tempfile.mkdtemp(prefix="unglare-postgres-", dir=place))
+    # Not below pytest's folder: PostgreSQL's user may not enter it.
+    folder = Path(tempfile.mkdtemp(prefix="unglare-postgres-", dir=_memory()))
     try:
         if os.geteuid() == 0:
             owner = pwd.getpwnam(_owner())
@@ -201,6 +205,12 @@ def _data_folder() -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder)
+
+
+def _memory() -> Path | None:
+    """Folder in memory, if there is one with room: a database is copied there 8 times faster."""
+    memory = Path("/dev/shm")
+    return memory if memory.is_dir() and shutil.disk_usage(memory).free > 1 << 29 else None
 
 
 def _owner() -> str:

@@ -11,17 +11,30 @@ from sqlalchemy.engine import Dialect
 from sqlalchemy.types import TypeDecorator
 
 SEARCHABLE = JSON().with_variant(JSONB(), "postgresql")
-"""A JSON object that PostgreSQL may index; see `ExactJson` for what it doesn't keep."""
+"""A JSON object of our own making that PostgreSQL may index; see `ExactJson` for what it doesn't keep."""
 
 SEQUENCE = BigInteger().with_variant(Integer(), "sqlite")
 """Number that the database counts up (SQLite does so for INTEGER only)."""
+
+
+class Words(TypeDecorator[str]):
+    """Text. The character 0 and half a surrogate pair, which PostgreSQL refuses, become a question mark."""
+
+    impl = Text
+    cache_ok = True
+
+    def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
+        """Replace what can't be stored everywhere: nobody types it, but anybody can send it."""
+        if value is None:
+            return None
+        return value.replace("\0", "?").encode("utf-8", "replace").decode()
 
 
 class ExactJson(TypeDecorator[Any]):
     """JSON values as the text that was written: for all that enters a hash or becomes a result again.
 
     Neither database's own JSON column does: PostgreSQL's JSONB forgets the order of keys, -0.0 and
-    whether 1e16 was a float; SQLite turns a text such as `3.0` in a column named JSON into the number 3.
+    whether 1e16 was a float, and refuses the character 0; SQLite turns a text such as `3.0` in a column named JSON into the number 3.
     """
 
     impl = Text
@@ -71,7 +84,7 @@ class UtcDateTime(TypeDecorator[datetime]):
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
-def words(kind: type[enum.StrEnum], name: str) -> Enum:
+def one_of(kind: type[enum.StrEnum], name: str) -> Enum:
     """Store an enumeration as its words, checked by a constraint `ck_<table>_<name>`."""
 
     def values(members: Any) -> list[str]:

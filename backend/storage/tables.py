@@ -22,7 +22,6 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     MetaData,
-    Text,
     UniqueConstraint,
     false,
 )
@@ -35,7 +34,8 @@ from backend.storage.columns import (
     ExactJson,
     ExactJsonOrNull,
     UtcDateTime,
-    words,
+    Words,
+    one_of,
 )
 from backend.storage.rows import EditKind, RunStatus
 
@@ -55,7 +55,7 @@ class Base(DeclarativeBase):
             "pk": "pk_%(table_name)s",
         }
     )
-    type_annotation_map = {datetime: UtcDateTime(), float: Double(), str: Text()}
+    type_annotation_map = {datetime: UtcDateTime(), float: Double(), str: Words()}
 
 
 class Scan(Base):
@@ -69,7 +69,7 @@ class Scan(Base):
     note: Mapped[str]
     method: Mapped[str]
     rig: Mapped[str]
-    rig_options: Mapped[dict[str, Any]] = mapped_column(SEARCHABLE)
+    rig_options: Mapped[dict[str, Any]] = mapped_column(ExactJson)
     preset: Mapped[str | None]
     recipe: Mapped[dict[str, dict[str, Any]]] = mapped_column(ExactJson)
     created: Mapped[datetime]
@@ -101,7 +101,7 @@ class Edit(Base):
     field: Mapped[str]
     old: Mapped[Any] = mapped_column(ExactJson, nullable=False)
     new: Mapped[Any] = mapped_column(ExactJson, nullable=False)
-    kind: Mapped[EditKind] = mapped_column(words(EditKind, "kind"))
+    kind: Mapped[EditKind] = mapped_column(one_of(EditKind, "kind"))
     group: Mapped[str]
     reverts: Mapped[str | None]
     reason: Mapped[str]
@@ -121,7 +121,7 @@ class Job(Base):
 
     id: Mapped[str] = mapped_column(primary_key=True)
     scan: Mapped[str] = mapped_column(ForeignKey("scans.id"))
-    status: Mapped[JobStatus] = mapped_column(words(JobStatus, "status"))
+    status: Mapped[JobStatus] = mapped_column(one_of(JobStatus, "status"))
     until: Mapped[str | None]
     unattended: Mapped[bool]
     stage: Mapped[str | None]
@@ -155,7 +155,7 @@ class Run(Base):
     stage: Mapped[str]
     key: Mapped[str]
     take: Mapped[int]
-    status: Mapped[RunStatus] = mapped_column(words(RunStatus, "status"))
+    status: Mapped[RunStatus] = mapped_column(one_of(RunStatus, "status"))
     started: Mapped[datetime]
     finished: Mapped[datetime | None]
     duration_s: Mapped[float | None]
@@ -183,7 +183,7 @@ class Decision(Base):
     run: Mapped[str] = mapped_column(ForeignKey("runs.id"))
     stage: Mapped[str]
     key: Mapped[str]
-    verdict: Mapped[Verdict] = mapped_column(words(Verdict, "verdict"))
+    verdict: Mapped[Verdict] = mapped_column(one_of(Verdict, "verdict"))
     reason: Mapped[str]
     who: Mapped[str]
     when: Mapped[datetime]
@@ -227,4 +227,4 @@ class Audit(Base):
     action: Mapped[str]
     stage: Mapped[str | None]
     sentence: Mapped[str]
-    details: Mapped[dict[str, Any]] = mapped_column(SEARCHABLE)
+    details: Mapped[dict[str, Any]] = mapped_column(ExactJson)

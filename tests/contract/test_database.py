@@ -269,7 +269,7 @@ for n in range(100_000):
 
 def test_a_writer_killed_at_any_moment_leaves_whole_transactions(sqlite_url: str) -> None:
     told: set[str] = set()
-    for round_, lines in enumerate([1, 2, 3, 5, 8]):
+    for round_, lines in enumerate([1, 3, 8]):
         told |= write_and_be_killed(sqlite_url, str(round_), lines)
     with contextlib.closing(Database(sqlite_url)) as opened:
         opened.upgrade()

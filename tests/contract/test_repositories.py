@@ -198,6 +198,7 @@ def test_values_that_enter_a_hash_come_back_exactly(
 ) -> None:
     with database.transaction() as r:
         r.edits.add(scan, an_edit(scan, old=value, new=value))
+        r.audit.add(scan, "ada", "edited", "zones", "Smoothed.", {"value": value})
         r.given.add(scan, "RigFacts", "RigFacts", {"value": value}, "1" * 64)
         r.frames.add(a_frame(scan, document={"value": value}))
         run = r.runs.start(scan, "zones", "k", 0)
@@ -207,6 +208,7 @@ def test_values_that_enter_a_hash_come_back_exactly(
         came_back = [
             edit.old,
             edit.new,
+            r.audit.of(scan)[0].details["value"],
             r.given.of(scan)["RigFacts"].document["value"],
             r.frames.of(scan, "fringe_capture", 0)[0].document["value"],
             (r.runs.get(run).document or {})["value"],
@@ -218,6 +220,18 @@ def test_values_that_enter_a_hash_come_back_exactly(
 def test_a_number_that_json_does_not_have_is_refused(database: Database, scan: str) -> None:
     with pytest.raises(Exception, match="not JSON compliant"), database.transaction() as r:
         r.edits.add(scan, an_edit(scan, new=float("nan")))
+
+
+@pytest.mark.parametrize("text_sent", ["two\0halves", "half a \ud83d pair"])
+def test_a_text_that_no_database_keeps_is_no_fault(database: Database, text_sent: str) -> None:
+    row = a_scan(name=text_sent)
+    with database.transaction() as r:
+        r.scans.add(row)
+        with pytest.raises(NotFoundError):
+            r.scans.get(text_sent)
+    with database.reading() as r:
+        assert r.scans.get(row.id).name.replace("?", "") in ("twohalves", "half a  pair")
+        assert r.scans.count(text_sent) == 1
 
 
 # --- edits -----------------------------------------------------------------------------------------
@@ -475,6 +489,22 @@ def test_the_audit_trail_keeps_its_order(database: Database, scan: str) -> None:
     assert (second.who, second.action, second.stage) == ("bob", "edited", "zones")
     assert (second.sentence, second.details) == ("Smoothed more.", {"new": 3.0})
     assert second.when.tzinfo is not None
+
+
+def test_counts_over_all_scans(database: Database, scan: str) -> None:
+    with database.transaction() as r:
+        r.frames.add(a_frame(scan))
+        r.jobs.add(a_job(scan))
+        for duration_s in (1.5, 2.0):
+            r.runs.finish(r.runs.start(scan, "zones", "k1", 0), {}, "h", (), duration_s)
+        r.runs.start(scan, "fusion", "k2", 0)
+    with database.reading() as r:
+        counts = r.statistics.counts()
+    assert (counts.scans, counts.frames, dict(counts.jobs)) == (1, 1, {"queued": 1})
+    assert [(c.stage, c.status, c.count, c.duration_s) for c in counts.runs] == [
+        ("fusion", "running", 1, 0.0),
+        ("zones", "finished", 2, 3.5),
+    ]
 
 
 # --- tables that only grow ---------------------------------------------------------------------------

@@ -55,7 +55,7 @@ class Statistics:
             frames=self._number_of(tables.Frame),
             jobs={status.value: count for status, count in self._session.execute(jobs)},
             runs=tuple(
-                RunCount(stage, status.value, count, float(duration_s))
+                RunCount(stage, status.value, count, float(duration_s or 0.0))
                 for stage, status, count, duration_s in self._session.execute(runs)
             ),
         )

@@ -68,7 +68,7 @@ def _create_scans() -> None:
         _text("note"),
         _text("method"),
         _text("rig"),
-        sa.Column("rig_options", _searchable(), nullable=False),
+        _text("rig_options"),
         _text("preset", nullable=True),
         _text("recipe"),
         sa.Column("created", _moment(), nullable=False),
@@ -225,7 +225,7 @@ def _create_audit() -> None:
         _text("action"),
         _text("stage", nullable=True),
         _text("sentence"),
-        sa.Column("details", _searchable(), nullable=False),
+        _text("details"),
         sqlite_autoincrement=True,
     )
     op.create_index("ix_audit_scan_sequence", "audit", ["scan", "sequence"])
