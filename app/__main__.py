@@ -83,7 +83,7 @@ def main() -> None:
     )  # the parent reads one line: nobody else may write there
     server = station.start(settings.secret)
     server.gui.configure_theme(
-        dark_mode=True, show_logo=False, show_share_button=False, brand_color=(76, 155, 255)
+        dark_mode=True, show_logo=False, show_share_button=False, brand_color=(51, 154, 240)
     )
     server.scene.world_axes.visible = False
     sessions = Sessions(settings)

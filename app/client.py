@@ -91,7 +91,7 @@ class ApiClient:
         The session's token that the proxy handed over.
     """
 
-    def __init__(self, base_url: str, token: str, *, timeout_s: float = 30.0) -> None:
+    def __init__(self, base_url: str, token: str, *, timeout_s: float = 300.0) -> None:
         self._http = httpx.Client(
             base_url=base_url,
             headers={"Authorization": f"Bearer {token}"},
@@ -263,7 +263,8 @@ def cloud_address(scan_id: str) -> str:
     return f"/api/scans/{quote(scan_id)}/cloud.ply"
 
 
-UPLOAD_ADDRESS = "/api/imports/upload"
+UPLOAD_PAGE = "/import"
+"""The backend's own page that uploads a captured folder."""
 
 
 def unpack_points(body: bytes) -> PointsPreview:

@@ -82,6 +82,15 @@ class Look:
         stages = self.method.stages if self.method else ()
         return next((s for s in stages if s.name == stage), None)
 
+    def cameras(self) -> list[str]:
+        """Return the cameras in the order in which the scan's first result with pictures has them."""
+        for stage in self.scan.stages:
+            for field in fields_of_kind(stage, "picture", "mask", "frames"):
+                names = list(field.arrays) or [f.camera for f in field.frames]
+                if len(set(names)) > 1:
+                    return list(dict.fromkeys(names))
+        return []
+
     def upto_stage(self) -> tuple[StageState, ...]:
         """Return the stages up to the one on the screen, that one first, then back to the start."""
         stages = self.scan.stages

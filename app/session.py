@@ -1,8 +1,8 @@
 """What one browser looks at, and what has to be redrawn when something changes.
 
-Three threads work for a browser. *Acts* owns the state: it calls the API for whatever the operator does and draws
-what follows from the answer. *Loads* fetches arrays, pictures and clouds. *Events* listens to the server. viser's own
-threads only put work into the queues, so they never wait.
+Four threads work for a browser. *Acts* owns the state: it calls the API for whatever the operator does and draws
+what follows from the answer. *Loads* fetches arrays, pictures and clouds. *Rigs* waits for rigs to open, which may take
+long. *Events* listens to the server. viser's own threads only put work into the queues, so they never wait.
 """
 
 import contextlib
@@ -47,6 +47,7 @@ from backend.contract.requests import (
     StartRun,
     UndoEdit,
 )
+from backend.contract.rigs import RigView
 from backend.contract.scans import ScanState
 
 _LOG = logging.getLogger(__name__)
@@ -84,6 +85,7 @@ class Session:
         self._stopping = threading.Event()
         self._acts = Worker(f"acts {client.client_id}", self._report)
         self._loads = Worker(f"loads {client.client_id}", self._report)
+        self._rigs = Worker(f"rigs {client.client_id}", self._report)
         self._events = threading.Thread(
             target=self._listen, name=f"events {client.client_id}", daemon=True
         )
@@ -94,6 +96,7 @@ class Session:
         self._stopping.set()
         self._acts.close()
         self._loads.close()
+        self._rigs.close()
         self.api.close()
 
     # ---- what panels ask for (see app/desk.py)
@@ -179,15 +182,19 @@ class Session:
 
     def create(self, request: CreateScan, *, run: bool) -> None:
         """Make a scan, open it, and run it if asked to."""
-        self.act(lambda: self._create(request, run=run))
+        self.act(lambda: self._patiently("Opening the rig", lambda: self._create(request, run=run)))
 
     def import_capture(self, request: ImportCapture) -> None:
         """Import a captured folder and open the scan."""
-        self.act(lambda: self._open(self.api.import_capture(request)))
+        self.act(
+            lambda: self._patiently(
+                "Importing", lambda: self._open(self.api.import_capture(request))
+            )
+        )
 
     def show_rig(self) -> None:
         """Show the rig that is chosen on the start page."""
-        self.load(self._show_rig, key="rig")
+        self._rigs.submit(self._show_rig, key="rig")
 
     def inspect(self, camera: str) -> None:
         """Show a camera's picture large."""
@@ -308,6 +315,16 @@ class Session:
         with self._client.atomic():
             self._home.visible = self._list_panel.visible = False
             self._scan.visible = self._scan_panel.visible = True
+
+    def _patiently(self, words: str, work: Work) -> None:
+        """Do what may take long, with a note that says so."""
+        note = self._client.add_notification(
+            words, "This may take a moment.", loading=True, with_close_button=False
+        )
+        try:
+            work()
+        finally:
+            note.remove()
 
     def _create(self, request: CreateScan, *, run: bool) -> None:
         scan = self.api.create(request)
@@ -443,7 +460,11 @@ class Session:
             )
 
     def _export(self, scan_id: str, folder: str, *, frames: bool) -> None:
-        written = self.api.export(scan_id, ExportScan(folder=folder, frames=frames))
+        request = ExportScan(folder=folder, frames=frames)
+        self._patiently("Exporting", lambda: self._write(scan_id, request))
+
+    def _write(self, scan_id: str, request: ExportScan) -> None:
+        folder, written = request.folder, self.api.export(scan_id, request)
         self.notify(
             "Exported",
             f"{len(written)} files in {folder}" if written else f"Written to {folder}",
@@ -494,8 +515,13 @@ class Session:
         name, options = chosen
         with contextlib.suppress(
             ApiError
-        ):  # half-typed options: the forms say what is wrong when it counts
-            self._rig.show(self.api.rig(name, options), f"rig {name} {options}")
+        ):  # half-typed options: what is wrong is said when it counts
+            rig = self.api.rig(name, options)
+            self.load(lambda: self._draw_rig(rig), key="rig")
+
+    def _draw_rig(self, rig: RigView) -> None:
+        if self._look is None:
+            self._rig.show(rig, "")
 
     def _inspect(self, camera: str) -> None:
         look = self._look

@@ -95,7 +95,7 @@ class Space:
 
     def view_part(self, radius: float) -> None:
         """Look at the part alone."""
-        self._look(np.array([0.0, 0.0, 0.12 * radius]), 1.05 * radius, np.deg2rad(40.0))
+        self._look(np.array([0.0, 0.0, 0.12 * radius]), 1.02 * radius, np.deg2rad(58.0))
 
     def view_top(self, radius: float) -> None:
         """Look down on the part, as the cameras do."""

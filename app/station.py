@@ -5,6 +5,7 @@ The four private details of viser that this needs stand here and nowhere else; a
 
 import contextlib
 import hmac
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -58,7 +59,8 @@ def guarded_serve(secret: str) -> Iterator[None]:
 
 def start(secret: str) -> viser.ViserServer:
     """Start viser on a free loopback port; only whoever knows the secret gets an answer."""
-    with guarded_serve(secret):
+    # viser greets the terminal, which is nobody's here.
+    with guarded_serve(secret), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     # Any browser could ask for a public tunnel through somebody else's server.
     for message in (viser_messages.ShareUrlRequest, viser_messages.ShareUrlDisconnect):

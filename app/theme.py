@@ -2,11 +2,11 @@
 
 _CSS = """
 :root, [data-mantine-color-scheme="dark"] {
-  --mantine-color-body: #191d23; --mantine-color-dark-9: #0f1216; --mantine-color-dark-8: #14171c;
-  --mantine-color-dark-7: #191d23; --mantine-color-dark-6: #21262e; --mantine-color-dark-5: #2b313b;
+  --mantine-color-body: #181c22; --mantine-color-dark-9: #101318; --mantine-color-dark-8: #14171c;
+  --mantine-color-dark-7: #181c22; --mantine-color-dark-6: #21262e; --mantine-color-dark-5: #2b313b;
   --mantine-color-dark-4: #353c48; --mantine-color-dark-3: #4b5464; --mantine-color-dark-2: #8b95a5;
   --mantine-color-dark-1: #aeb6c2; --mantine-color-dark-0: #d4d9e1;
-  --ug-line: #2e3540; --ug-raised: #21262e; --ug-text: #d9dee6; --ug-dim: #939dac; --ug-accent: #4c9bff; --ug-amber: #e8a33d;
+  --ug-line: #2e3540; --ug-raised: #21262e; --ug-text: #d9dee6; --ug-dim: #939dac; --ug-accent: #339af0; --ug-amber: #e8a33d;
 }
 canvas[data-engine] { background: radial-gradient(120% 90% at 50% 38%, #262c36 0%, #181c22 55%, #101317 100%); }
 button:has(> span svg.tabler-icon-adjustments), button:has(svg.tabler-icon-adjustments) { display: none !important; }
@@ -46,6 +46,7 @@ div:has(> i.ug-row2) + div:has(input, button), div:has(> i.ug-row2) + div:has(in
 .ug-note { color: var(--ug-dim); font-size: 11.5px; }
 .ug-doc { color: var(--ug-dim); font-size: 12px; line-height: 1.35; margin: 3px 0 0; }
 .ug-text { padding: 2px 12px 8px; font-size: 13px; line-height: 1.4; color: var(--ug-text); }
+.ug-text.ug-doc { color: var(--ug-dim); font-size: 12px; }
 .ug-download { display: block; text-align: center; color: #dce9ff; background: #24456f; border-radius: 3px; padding: 7px; text-decoration: none; font-weight: 500; } .ug-download:hover { background: #2d568a; } .ug-download:focus-visible { outline: 2px solid #7db4ff; outline-offset: 1px; }
 .ug-heading { margin: 8px 12px 4px; font-size: 12.5px; font-weight: 600; color: #c3cad5; display: flex; justify-content: space-between; align-items: baseline; }
 .ug-heading .ug-note { font-weight: 400; }
@@ -70,8 +71,8 @@ div:has(> i.ug-row2) + div:has(input, button), div:has(> i.ug-row2) + div:has(in
 .ug-step.ug-is-accepted i, .ug-step.ug-is-failed i, .ug-step.ug-is-rejected i, .ug-step.ug-is-awaiting_review i { background: var(--c); color: #10151b; }
 .ug-step.ug-is-running i { background: #16304f; box-shadow: 0 0 0 3px #4c9bff40; }
 .ug-step.ug-is-unavailable i, .ug-step.ug-is-pending i { border-color: #414a58; color: #8a94a3; }
-.ug-step.ug-selected { background: #242b35; }
-.ug-step.ug-selected span { color: #f2f5f8; font-weight: 600; }
+.ug-step.ug-selected { background: #262e39; box-shadow: inset 0 -2px var(--ug-accent); }
+.ug-step.ug-selected span { color: #fff; }
 label.ug-step:hover { background: #232932; }
 
 /* status */
@@ -140,9 +141,7 @@ label.ug-scan:hover { border-color: #44618a; background: #242b35; }
 .ug-scan-facts { display: flex; justify-content: space-between; gap: 8px; font-size: 11.5px; color: var(--ug-dim); margin-top: 3px; }
 .ug-dots { display: inline-flex; gap: 3px; align-items: center; } .ug-dots i { width: 6px; height: 6px; border-radius: 50%; background: #3a4350; } .ug-dots i.ug-on { background: var(--c); }
 .ug-pager { display: flex; justify-content: center; gap: 24px; padding: 8px; }
-.ug-upload { padding: 4px 12px 8px; } .ug-upload form { display: flex; gap: 6px; margin: 6px 0; } .ug-upload input { flex: 1; min-width: 0; font-size: 12px; color: var(--ug-dim); }
-.ug-upload button { background: #333b47; color: var(--ug-text); border: 0; border-radius: 3px; padding: 4px 12px; font-size: 12.5px; cursor: pointer; }
-.ug-upload iframe { width: 100%; height: 34px; border: 0; border-radius: 3px; background: #d4d9e1; }
+.ug-upload { margin: 0; }
 """
 
 STYLE = f"<style>{_CSS}</style>"

@@ -3,14 +3,15 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from app.numbers import number
+from app.numbers import heading, number
 
 Kind = Literal["number", "integer", "switch", "choice", "numbers", "text", "document"]
 
 AUTOMATIC = "auto"
+_LONG, _FIRST = 10, 6
 _EDGE = 1e-9
 """How far a control keeps from a limit that is excluded."""
 
@@ -61,9 +62,15 @@ class Setting:
 
 
 def read_schema(schema: Mapping[str, Any]) -> tuple[Setting, ...]:
-    """Return the settings of a schema, in its order."""
+    """Return the settings of a schema, in its order.
+
+    In a long schema that calls nothing advanced, what comes after the first few is.
+    """
     shared = schema.get("$defs", {})
-    return tuple(_setting(n, p, shared) for n, p in schema.get("properties", {}).items())
+    settings = tuple(_setting(n, p, shared) for n, p in schema.get("properties", {}).items())
+    if len(settings) <= _LONG or any(s.advanced for s in settings):
+        return settings
+    return tuple(replace(s, advanced=i >= _FIRST) for i, s in enumerate(settings))
 
 
 def _setting(name: str, described: Mapping[str, Any], shared: Mapping[str, Any]) -> Setting:
@@ -74,13 +81,14 @@ def _setting(name: str, described: Mapping[str, Any], shared: Mapping[str, Any])
     core = {**facts, **kinds[0]} if len(kinds) == 1 else facts
     # Titles and descriptions of the setting win over those of its type.
     core = {**core, **{k: facts[k] for k in ("title", "description", "default") if k in facts}}
+    title, unit = _title(name, core)
     items = _resolved(core.get("items") or {}, shared) if core.get("type") == "array" else core
     return Setting(
         name=name,
-        title=str(core.get("title") or name.replace("_", " ")),
+        title=title,
         kind=_kind(core, shared, ambiguous=len(kinds) > 1),
         doc=str(core.get("description") or ""),
-        unit=str(core.get("unit") or ""),
+        unit=unit,
         default=core.get("default"),
         optional=optional,
         choices=_choices(core),
@@ -88,6 +96,16 @@ def _setting(name: str, described: Mapping[str, Any], shared: Mapping[str, Any])
         high=_limit(items, "maximum", "exclusiveMaximum", -_EDGE),
         advanced=bool(core.get("advanced")),
     )
+
+
+def _title(name: str, core: Mapping[str, Any]) -> tuple[str, str]:
+    """Return title and unit; where nobody wrote a title, the name has both."""
+    title, unit = str(core.get("title") or ""), str(core.get("unit") or "")
+    made_up = {"", name, name.replace("_", " ").title()}  # pydantic's own way to make a title
+    if title not in made_up:
+        return title, unit
+    words, named_unit = heading(name)
+    return words[:1].upper() + words[1:], unit or named_unit
 
 
 def _resolved(described: Mapping[str, Any], shared: Mapping[str, Any]) -> dict[str, Any]:

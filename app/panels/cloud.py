@@ -212,7 +212,7 @@ class CloudPanel:
             if shown < total
             else f"{number(total)} points"
         )
-        lines = markup.div("", markup.esc(f"{look.scan.id} · {of}"))
+        lines = markup.div("", markup.esc(f"{look.scan.name or look.scan.id} · {of}"))
         if look.may_operate:
             lines += self._links("View", self._views()) + self._links(
                 "Show", self._budgets(shown, total)
@@ -227,9 +227,10 @@ class CloudPanel:
         return markup.div("ug-views", markup.span("", head) + "".join(made))
 
     def _budgets(self, shown: int, total: int) -> list[tuple[str, Callable[[], None]]]:
-        if total <= LIVE_BUDGET and shown == total:
-            return []
-        return [(name, partial(self._set_budget, budget)) for name, budget in _BUDGETS.items()]
+        smaller = {name: budget for name, budget in _BUDGETS.items() if budget < total}
+        if shown < total or smaller:
+            smaller["all" if total <= FULL_BUDGET else "3 M"] = FULL_BUDGET
+        return [(name, partial(self._set_budget, budget)) for name, budget in smaller.items()]
 
     def _views(self) -> list[tuple[str, Callable[[], None]]]:
         return [

@@ -1,19 +1,27 @@
 """Making a scan: method, rig and its options, preset, name; or importing a captured folder."""
 
+from datetime import datetime
 from typing import Any
 
 import viser
 
 from app import markup
-from app.client import UPLOAD_ADDRESS
+from app.client import UPLOAD_PAGE
 from app.desk import Desk
 from app.forms.form import Form
-from app.forms.schema import UnreadableError, read_schema
+from app.forms.schema import Setting, UnreadableError, read_schema
 from backend.contract.descriptions import MethodDescription
 from backend.contract.requests import CreateScan, ImportCapture
 from backend.contract.rigs import RigOffer
 
 _NO_PRESET = "none"
+_FREE = Setting(
+    "options",
+    "Options",
+    "document",
+    "What this rig takes, as JSON; it doesn't say what.",
+    default={},
+)
 
 
 class NewScanPanel:
@@ -26,6 +34,7 @@ class NewScanPanel:
         self._options: Form | None = None
         self._options_folder: viser.GuiFolderHandle | None = None
         self._errors: dict[str, str] = {}
+        self._defaults: dict[str, Any] = {}
         self._made_for = ""
         gui.add_html(markup.div("ug-heading", "New scan"))
         self._method = gui.add_dropdown("Method", ["–"])
@@ -44,7 +53,9 @@ class NewScanPanel:
 
     def fill(self, methods: tuple[MethodDescription, ...], rigs: tuple[RigOffer, ...]) -> None:
         """Learn what there is to choose from."""
-        self._methods = {_unique(m.title, m.name, [n.title for n in methods]): m for m in methods}
+        # Methods that can take pictures come first: the others only work on imported ones.
+        ordered = sorted(methods, key=lambda m: not any(s.captures for s in m.stages))
+        self._methods = {_unique(m.title, m.name, [n.title for n in methods]): m for m in ordered}
         self._rigs = {_unique(r.title, r.name, [n.title for n in rigs]): r for r in rigs}
         _set_options(self._method, list(self._methods) or ["–"])
         _set_options(self._rig, list(self._rigs) or ["–"])
@@ -52,9 +63,17 @@ class NewScanPanel:
         self._show_rig()
 
     def options(self) -> dict[str, Any]:
-        """Return the rig's options as the form shows them, without those that say nothing."""
+        """Return the rig's options that differ from their defaults.
+
+        Raises
+        ------
+        UnreadableError
+            If a text is no value of its option.
+        """
         values = self._options.values() if self._options else {}
-        return {name: value for name, value in values.items() if value is not None}
+        if set(values) == {_FREE.name}:
+            return dict(values[_FREE.name])
+        return {n: v for n, v in values.items() if v != self._defaults.get(n)}
 
     def _listen(self) -> None:
         @self._method.on_update
@@ -96,17 +115,14 @@ class NewScanPanel:
         if self._options_folder is not None:
             self._options_folder.remove()
         self._options, self._options_folder, self._errors = None, None, {}
-        settings = read_schema(rig.options_schema)
-        if settings:
-            with self._options_place:
-                self._options_folder = self._gui.add_folder("Rig options")
-            with self._options_folder:
-                self._options = Form(
-                    self._gui,
-                    settings,
-                    on_edit=lambda *_: self._desk.show_rig(),
-                    on_error=self._remember,
-                )
+        settings = read_schema(rig.options_schema) or (_FREE,)
+        self._defaults = {s.name: _as_list(s.default) for s in settings}
+        with self._options_place:
+            self._options_folder = self._gui.add_folder("Rig options")
+        with self._options_folder:
+            self._options = Form(
+                self._gui, settings, on_edit=lambda *_: None, on_error=self._remember
+            )
         self._desk.show_rig()
 
     def chosen_rig(self) -> tuple[str, dict[str, Any]] | None:
@@ -133,7 +149,7 @@ class NewScanPanel:
             return
         preset = self._preset.value
         request = CreateScan(
-            method=method.name, rig=rig.name, rig_options=self.options(), name=self._name.value.strip(), note=self._note.value.strip(),
+            method=method.name, rig=rig.name, rig_options=self.options(), name=self._name.value.strip() or _name_of_now(), note=self._note.value.strip(),
             preset=None if preset == _NO_PRESET else preset,
         )  # fmt: skip
         self._desk.create(request, run=run)
@@ -146,7 +162,7 @@ class NewScanPanel:
             )
             name = self._gui.add_text("Name", "")
             button = self._gui.add_button("Import", color="gray", icon=viser.Icon.FOLDER_OPEN)
-            self._gui.add_html(_UPLOAD)
+            self._gui.add_html(markup.div("ug-text", _upload_link()))
 
         @button.on_click
         async def _(_: viser.GuiEvent[Any]) -> None:
@@ -154,12 +170,18 @@ class NewScanPanel:
             self._desk.act(lambda: self._desk.import_capture(request))
 
 
-_UPLOAD = (
-    '<div class="ug-upload"><div class="ug-note">or a zip file from this computer; the scan appears in the list</div>'
-    f'<form action="{UPLOAD_ADDRESS}" method="post" enctype="multipart/form-data" target="ug-upload-answer">'
-    '<input type="file" name="file" accept=".zip" required><button type="submit">Upload</button></form>'
-    '<iframe name="ug-upload-answer" title="Answer of the server"></iframe></div>'
-)
+def _upload_link() -> str:
+    words = "or upload a zip file from this computer …"
+    return markup.tag("a", "ug-link ug-upload", words, href=UPLOAD_PAGE, target="_blank")
+
+
+def _name_of_now() -> str:
+    now = datetime.now().astimezone()
+    return f"Scan {now.day} {now:%b, %H:%M}"
+
+
+def _as_list(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _unique(title: str, name: str, titles: list[str]) -> str:

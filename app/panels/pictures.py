@@ -172,6 +172,11 @@ class PicturesPanel:
         )  # fmt: skip
 
     def _figures_of(self, choice: Choice, max_px: int) -> list[Figure]:
+        order = self._look.cameras() if self._look else []
+        figures = self._unordered_figures(choice, max_px)
+        return sorted(figures, key=lambda f: order.index(f.camera) if f.camera in order else -1)
+
+    def _unordered_figures(self, choice: Choice, max_px: int) -> list[Figure]:
         field, kind = choice.field, choice.field.hint.get("kind")
         if kind == "frames":
             picked = frame_view.FrameMenu(field.frames).pick(

@@ -65,7 +65,8 @@ class ScanListPanel:
         colour, words = STATES.get(scan.status, STATES["pending"])
         state = f'<span class="ug-state" style="--c:{colour}">{markup.esc(words)}</span>'
         head = markup.div(
-            "ug-scan-head", markup.span("ug-name", markup.esc(scan.name or scan.id)) + state
+            "ug-scan-head",
+            markup.span("ug-name", markup.esc(scan.name or f"Scan {scan.id}")) + state,
         )
         points = (
             f"{number(scan.points)} points"
@@ -73,7 +74,7 @@ class ScanListPanel:
             else f"stage {scan.stages_done} of {scan.stages}"
         )
         method = self._titles.get(scan.method, scan.method)
-        facts = " · ".join((scan.id, moment(scan.created, now), scan.who, points))
+        facts = " · ".join((moment(scan.created, now), scan.who, points))
         dots = "".join(
             f'<i class="{"ug-on" if i < scan.stages_done else ""}"></i>' for i in range(scan.stages)
         )
@@ -87,7 +88,7 @@ class ScanListPanel:
             lambda: self._desk.open_scan(scan.id),
             inner,
             "ug-scan",
-            f"Open {scan.name}",
+            f"Open scan {scan.id}",
         )
 
     def _pager(self, *, more: bool) -> str:

@@ -1,5 +1,6 @@
 """Head of the right panel: which scan, where in it, what it says, and the decision."""
 
+from datetime import UTC, datetime
 from typing import Any
 
 import viser
@@ -8,10 +9,10 @@ from app import markup
 from app.clicks import Clicks
 from app.desk import Desk
 from app.look import Look
-from app.numbers import duration
+from app.numbers import duration, moment
 from app.palette import STATES
 from app.panels.decision import Buttons, Small, buttons
-from backend.contract.scans import ScanState, StageState
+from backend.contract.scans import StageState
 
 _SYMBOLS = {
     "done": "✓",
@@ -38,7 +39,7 @@ class StagePanel:
     def draw(self, look: Look) -> None:
         """Show this state."""
         clicks = self._desk.clicks if look.may_operate else None
-        self._head.content = head_html(look.scan, self._desk, clicks)
+        self._head.content = head_html(look, self._desk, clicks)
         self._stepper.content = stepper_html(look, clicks, self._desk)
         self._status.content = status_html(look)
         if self._buttons is not None:
@@ -96,11 +97,16 @@ def _on_click(button: viser.GuiButtonHandle, work: Any) -> None:
         work()
 
 
-def head_html(scan: ScanState, desk: Desk, clicks: Clicks | None) -> str:
+def head_html(look: Look, desk: Desk, clicks: Clicks | None) -> str:
     """Return the scan's name with the way back and what can be done to the scan as a whole."""
+    scan = look.scan
     colour, words = STATES.get(scan.status, STATES["pending"])
-    name = markup.div("ug-title", markup.esc(scan.name or scan.id), title=scan.name)
-    facts = " · ".join(t for t in (scan.id, scan.method, scan.rig, scan.who) if t)
+    title = scan.name or f"Scan {scan.id}"
+    hint = "\n".join(t for t in (title, scan.note, f"Scan {scan.id}") if t)
+    name = markup.div("ug-title", markup.esc(title), title=hint)
+    method = look.method.title if look.method else scan.method
+    made = f"{scan.who}, {moment(scan.created, datetime.now(UTC))}"
+    facts = " · ".join(t for t in (method, scan.rig, made) if t)
     below = markup.div("ug-subtitle", markup.esc(facts), title=facts)
     state = f'<span class="ug-state" style="--c:{colour}">{markup.esc(words)}</span>'
     if clicks is None:
@@ -169,9 +175,9 @@ def _sentence(look: Look, stage: StageState) -> str:
     job = look.scan.job
     if stage.status == "running" and job is not None:
         return job.text or "Running"
-    if stage.decision is not None and stage.status in ("accepted", "rejected"):
-        why = f": {stage.decision.reason}" if stage.decision.reason else ""
-        return f"{stage.message} ({stage.status} by {stage.decision.who}{why})"
+    reason = stage.decision.reason if stage.decision is not None else ""
+    if reason and reason not in stage.message:
+        return f"{stage.message} “{reason}”"
     return stage.message
 
 

@@ -16,6 +16,8 @@ Array = NDArray[Any]
 AXIS = {"stroke": "#9aa4b2", "grid": {"stroke": "rgba(148,163,184,.13)", "width": 1}, "ticks": {"stroke": "rgba(148,163,184,.3)", "size": 4}}  # fmt: skip
 FONT = "11px system-ui, sans-serif"
 _MOST_SAMPLES = 2000
+_LINEAR, _LOGARITHMIC = 1, 3
+"""uPlot's numbers for how an axis is divided."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,6 @@ def add_curves(
     drawn = [_drawable(line[::step], log=log_y) for line in lines]
     title = y_axis.text
     titles = list(names) or [str(i + 1) for i in range(len(lines))]
-    if log_y:
-        title = f"log₁₀ {title}"
     series: list[Any] = [{"label": x_axis.text or "x"}]
     series += [
         {"label": name, "stroke": label_colour(i + 1), "width": 1.6, "points": {"show": False}}
@@ -68,7 +68,7 @@ def add_curves(
     chart = gui.add_uplot(
         (across[::step], *drawn),
         tuple(series),
-        scales={"x": {"time": False}},
+        scales={"x": {"time": False}, "y": {"distr": _LOGARITHMIC if log_y else _LINEAR}},
         axes=axes(x_axis.text, title),
         legend={"show": False},
         cursor={"drag": {"x": False, "y": False}},
@@ -96,10 +96,9 @@ def axes(x_title: str, y_title: str) -> tuple[Any, ...]:
 
 
 def _drawable(line: Array, *, log: bool) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        heights = np.log10(line) if log else line
-    finite = np.isfinite(heights)
-    if not finite.any():
-        return np.zeros_like(heights)
-    samples = np.arange(len(heights))
-    return np.interp(samples, samples[finite], heights[finite])
+    """Put a straight line over what can't be drawn: a gap, or what isn't positive on a logarithmic axis."""
+    usable = np.isfinite(line) & ((line > 0) | (not log))
+    if not usable.any():
+        return np.ones_like(line) if log else np.zeros_like(line)
+    samples = np.arange(len(line))
+    return np.interp(samples, samples[usable], line[usable])

@@ -103,7 +103,11 @@ def _farthest(points_mm: Array, up: Array) -> Ground:
 def modes(cloud: PointsPreview, ground: Ground) -> dict[str, Mode]:
     """Return the ways to colour a cloud, in the order of the menu."""
     heights = ground.heights_mm(cloud.points_mm)
-    title = "Height above the table" if ground.is_table else "Height above the farthest point"
+    title = (
+        "Height above the largest flat surface"
+        if ground.is_table
+        else "Height above the farthest point"
+    )
     ways = {"Height": Mode(title, "mm", "turbo", *_ends(heights), heights)}
     if cloud.colour is not None:
         ways["Intensity"] = Mode("Picture's brightness", "", "gray", 0.0, 255.0, None)
