@@ -85,8 +85,8 @@ class Look:
     def cameras(self) -> list[str]:
         """Return the cameras in the order in which the scan's first result with pictures has them."""
         for stage in self.scan.stages:
-            for field in fields_of_kind(stage, "picture", "mask", "frames"):
-                names = list(field.arrays) or [f.camera for f in field.frames]
+            for view in fields_of_kind(stage, "picture", "mask", "frames"):
+                names = list(view.arrays) or [f.camera for f in view.frames]
                 if len(set(names)) > 1:
                     return list(dict.fromkeys(names))
         return []

@@ -16,8 +16,6 @@ Array = NDArray[Any]
 AXIS = {"stroke": "#9aa4b2", "grid": {"stroke": "rgba(148,163,184,.13)", "width": 1}, "ticks": {"stroke": "rgba(148,163,184,.3)", "size": 4}}  # fmt: skip
 FONT = "11px system-ui, sans-serif"
 _MOST_SAMPLES = 2000
-_LINEAR, _LOGARITHMIC = 1, 3
-"""uPlot's numbers for how an axis is divided."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ def add_curves(
     chart = gui.add_uplot(
         (across[::step], *drawn),
         tuple(series),
-        scales={"x": {"time": False}, "y": {"distr": _LOGARITHMIC if log_y else _LINEAR}},
+        scales={"x": {"time": False}, "y": {"distr": 3 if log_y else 1}},
         axes=axes(x_axis.text, title),
         legend={"show": False},
         cursor={"drag": {"x": False, "y": False}},
