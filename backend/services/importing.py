@@ -71,8 +71,8 @@ class Importer:
         """
         folder = open_capture(path)
         method = self.registry.get(folder.capture.method)
-        plan = _ImportPlan(folder, method, _scan_file(folder))
-        calibration = capture_calibration(folder.capture)  # before hundreds of frames are read
+        plan = _ImportPlan(folder, method, read_scan_file(folder))
+        calibration = plan.calibration()  # before hundreds of frames are read
         recipe = plan.recipe()
         stored = self._store_frames(plan, progress)
         scan = new_id()
@@ -300,6 +300,12 @@ class _ImportPlan:
                 chosen[s.name] = values
         return check_recipe(self.method, None, chosen)
 
+    def calibration(self) -> RigCalibration | None:
+        """Return the folder's own calibration, where an export doesn't bring the exact one."""
+        if self.scan_file and RigCalibration.__name__ in self.scan_file.given:
+            return None
+        return capture_calibration(self.folder.capture)
+
     def given_of_export(self, store: ArtifactStore) -> list[GivenRow]:
         """Return what was handed over with the exported scan, but for imported frames."""
         if self.scan_file is None:
@@ -334,7 +340,14 @@ class _ImportPlan:
         return details
 
 
-def _scan_file(folder: CaptureFolder) -> ScanFile | None:
+def read_scan_file(folder: CaptureFolder) -> ScanFile | None:
+    """Read the `scan.json` beside a capture; None if there is none.
+
+    Raises
+    ------
+    InvalidCaptureError
+        If it isn't one of ours, or of a version that isn't known.
+    """
     if folder.scan is None:
         return None
     file = folder.folder / "scan.json"

@@ -1,6 +1,6 @@
 """Every use case under one roof: what the API and the command line call. Each is one transaction."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,16 @@ from backend.jobs.recovery import recover
 from backend.jobs.rigs import RigPool
 from backend.jobs.runner import Runner
 from backend.methods import Registry
-from backend.services import editing, importing, rigs, running, scans
+from backend.services import (
+    editing,
+    exporting,
+    importing,
+    replaying,
+    reporting,
+    rigs,
+    running,
+    scans,
+)
 from backend.services.context import Context
 from backend.services.events import EventHub
 from backend.services.points import pack_points
@@ -136,6 +145,35 @@ class Services:
         return importing.import_capture(
             self.context, Path(path), name=name, who=who, progress=progress
         )
+
+    def export(
+        self,
+        scan: str,
+        folder: str,
+        frames: bool,
+        who: str,
+        progress: Progress | None = None,
+    ) -> tuple[Path, ...]:
+        """Write a scan's results into a folder and return its files; see `exporting.export_scan`."""
+        return exporting.export_scan(
+            self.context, scan, Path(folder), frames=frames, who=who, progress=progress
+        )
+
+    def cloud_ply(self, scan: str) -> Iterator[bytes | memoryview]:
+        """Return the last cloud of a scan as a PLY file, in pieces; ConflictError if it has none."""
+        return exporting.cloud_parts(self.context, scan)
+
+    def replay(self, scan: str, progress: Progress | None = None) -> replaying.Replay:
+        """Do a scan again from its captured frames and compare; see `replaying.replay_scan`."""
+        return replaying.replay_scan(self.context, scan, progress=progress)
+
+    def replay_folder(self, path: str, progress: Progress | None = None) -> replaying.Replay:
+        """Do an exported scan again and compare; see `replaying.replay_folder`."""
+        return replaying.replay_folder(Path(path), self.context.registry, progress=progress)
+
+    def report(self, scan: str) -> reporting.ScanReport:
+        """Say what a scan is worth; see `reporting.report`."""
+        return reporting.report(self.context, scan)
 
     # changes
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,7 +21,7 @@ from backend.domain.errors import (
 )
 from backend.domain.states import StageStatus
 from backend.services.export_folder import ExportFolder
-from tests.scans.toy_house import House, data_folder, hashes, inline_house, stage, statuses
+from tests.scans.toy_house import House, data_folder, hashes, inline_house, stage
 
 
 @pytest.fixture
@@ -141,12 +142,11 @@ def test_a_shot_that_was_never_captured_is_asked_for_in_one_sentence(
     assert "\n" not in failed.message
 
 
-def test_a_redo_without_a_rig_is_unavailable(house, other_house, scan, tmp_path):
+def test_without_a_rig_nothing_can_be_taken_again(house, other_house, scan, tmp_path):
     folder = export(house, scan, tmp_path / "out")
     imported = other_house.services.import_capture(str(folder), "", "bob")
-    state = other_house.redo(imported, "toy_fringes")
-    assert statuses(state)["fringes"] == "unavailable"
-    assert "needs a rig" in stage(state, "toy_fringes").message
+    with pytest.raises(ConflictError, match="no rig"):
+        other_house.redo(imported, "toy_fringes")
 
 
 def test_a_replay_of_the_scan_is_the_same(house, scan):
@@ -166,8 +166,6 @@ def test_a_replay_of_the_export_is_the_same(house, scan, tmp_path):
 
 
 def test_a_replay_names_the_stages_that_differ(house, scan, tmp_path):
-    import cv2
-
     folder = export(house, scan, tmp_path / "out")
     picture = folder / "frames/toy_fringes/left/0003.png"
     gray = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)

@@ -1,0 +1,313 @@
+"""Export a scan into a folder: cloud, maps, how it came about, and on request the captured frames."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from backend.contract.scan_file import (
+    ScanFile,
+    WrittenAudit,
+    WrittenDecision,
+    WrittenEdit,
+    WrittenGiven,
+    WrittenMethod,
+    WrittenScan,
+    WrittenSetting,
+    WrittenStage,
+)
+from backend.contract.scans import ScanState, StageState
+from backend.domain.errors import ConflictError
+from backend.domain.rig import RigCalibration, RigFacts
+from backend.domain.shots import Progress
+from backend.jobs.loading import LoadedScan, load_scan
+from backend.services.context import Context
+from backend.services.export_capture import write_capture
+from backend.services.export_folder import (
+    SCAN_FILE,
+    Array,
+    ExportFolder,
+    refuse_foreign,
+    safe_name,
+    whole_folder,
+)
+from backend.services.ply import ply_parts
+from backend.services.portable import written_out
+from backend.services.reporting import load_cloud, report
+from backend.services.states import scan_state
+from backend.services.telling import announce
+from backend.stages.cloud import Cloud
+from backend.storage.artifacts import ArtifactStore
+from backend.storage.codec import decode
+from backend.storage.rows import AuditRow, DecisionRow, EditRow, FrameRow, GivenRow, RunRow
+
+_MAPS = ("picture", "mask")
+
+
+def export_scan(
+    context: Context,
+    scan: str,
+    folder: Path,
+    *,
+    frames: bool,
+    who: str,
+    progress: Progress | None = None,
+) -> tuple[Path, ...]:
+    """Write a scan's present results into a folder and return its files.
+
+    `scan.json` (how the scan came about, see `contract.scan_file`), `cloud.ply`,
+    `maps/<stage>.<field>[.<camera>].npy` for every shown map, and with `frames` the captured frames in the
+    import format, so that importing the folder gives the same results again. The folder appears whole or not
+    at all; an older export in its place is replaced.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such scan.
+    ConflictError
+        If the folder holds anything else than an export, or can't be written.
+    StorageFullError
+        If there is no room; nothing is left behind.
+    """
+    refuse_foreign(folder.expanduser().absolute())  # before the truth is asked for
+    metrics = report(context, scan).document()
+    content = _Content.read(context, scan)
+    if frames and not content.has_frames:
+        raise ConflictError(
+            f"Scan {content.loaded.title!r} has no frames yet: run it, or export it without frames."
+        )
+    with whole_folder(folder) as target:
+        _write_results(target, content, context.store)
+        if frames:
+            _write_frames(target, content, context.store, progress)
+        given = {
+            name: _written_given(target, content, name, context.store) for name in content.given
+        }
+        document = content.scan_file(context, given, metrics, dict(target.hashes))
+        target.write_json(SCAN_FILE, document.model_dump(mode="json"))
+        names = sorted(target.hashes)
+    with context.database.transaction() as repositories:
+        sentence = f"Exported to {folder}{' with frames' if frames else ''}."
+        repositories.audit.add(scan, who, "exported", None, sentence, {"folder": str(folder)})
+        state = scan_state(context, repositories, scan)
+    announce(context, state)
+    return tuple(folder / name for name in names)
+
+
+def cloud_parts(context: Context, scan: str) -> Iterator[bytes | memoryview]:
+    """Return the last cloud of a scan as a PLY file, in pieces.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such scan.
+    ConflictError
+        If it has no cloud.
+    """
+    with context.database.reading() as repositories:
+        loaded = load_scan(repositories, context.registry, scan)
+        cloud = load_cloud(context, repositories, loaded)
+    if cloud is None:
+        raise ConflictError(f"Scan {loaded.title!r} has no cloud yet: run it to the end.")
+    return ply_parts(cloud)
+
+
+@dataclass(frozen=True)
+class _Content:
+    """Everything of one scan, read in one transaction."""
+
+    state: ScanState
+    loaded: LoadedScan
+    cloud: Cloud | None
+    runs: Mapping[str, RunRow]
+    """The runs of the present results, by stage."""
+    journal: tuple[FrameRow, ...]
+    """Frames of the present takes."""
+    decisions: tuple[DecisionRow, ...]
+    edits: tuple[EditRow, ...]
+    audit: tuple[AuditRow, ...]
+    facts: RigFacts | None
+    calibration: RigCalibration | None
+
+    @classmethod
+    def read(cls, context: Context, scan: str) -> "_Content":
+        """Read it; NotFoundError if there is no such scan."""
+        with context.database.reading() as repositories:
+            loaded = load_scan(repositories, context.registry, scan)
+            takes = {(p.name, p.take) for p in loaded.plan.stages if p.stage.captures}
+            journal = repositories.frames.of_scan(scan)
+            return cls(
+                state=scan_state(context, repositories, scan),
+                loaded=loaded,
+                cloud=load_cloud(context, repositories, loaded),
+                runs={p.name: p.run for p in loaded.plan.stages if p.run},
+                journal=tuple(row for row in journal if (row.stage, row.take) in takes),
+                decisions=tuple(repositories.decisions.of(scan)),
+                edits=tuple(repositories.edits.of(scan)),
+                audit=tuple(repositories.audit.of(scan)),
+                facts=_given(loaded, RigFacts, context.store),
+                calibration=_given(loaded, RigCalibration, context.store),
+            )
+
+    @property
+    def has_frames(self) -> bool:
+        """True if something was captured or imported."""
+        imported = set(self.given) & set(self.loaded.method.importers)
+        return self.facts is not None and bool(self.journal or imported)
+
+    @property
+    def given(self) -> Mapping[str, GivenRow]:
+        """Results handed over with the scan."""
+        return self.loaded.given
+
+    def scan_file(
+        self,
+        context: Context,
+        given: dict[str, WrittenGiven],
+        metrics: dict[str, Any],
+        files: dict[str, str],
+    ) -> ScanFile:
+        """Write how the scan came about."""
+        row, method = self.loaded.row, self.loaded.method
+        return ScanFile(
+            format="unglare-scan",
+            version=1,
+            unglare=context.version,
+            exported=_second(context.clock()),
+            scan=WrittenScan(
+                id=row.id,
+                name=row.name,
+                note=row.note,
+                who=row.who,
+                created=row.created,
+                revision=row.revision,
+                rig=row.rig,
+                rig_options=dict(row.rig_options),
+                preset=row.preset,
+            ),
+            method=WrittenMethod(name=method.name, title=method.title),
+            settings={s.name: _written_settings(s) for s in self.state.stages},
+            stages=tuple(self._stage(s) for s in self.state.stages),
+            given=given,
+            decisions=tuple(_written_decision(d) for d in self.decisions),
+            edits=tuple(_written_edit(e) for e in self.edits),
+            audit=tuple(_written_audit(a) for a in self.audit),
+            devices={name: d for run in self.runs.values() for name, d in run.device.items()},
+            metrics=metrics,
+            files=files,
+        )
+
+    def _stage(self, state: StageState) -> WrittenStage:
+        run = self.runs.get(state.name)
+        return WrittenStage(
+            name=state.name,
+            title=state.title,
+            version=self.loaded.method.stage(state.name).version,
+            status=state.status.value,
+            message=state.message,
+            key=state.key,
+            take=state.take,
+            run=state.stage_run,
+            result_hash=state.result_hash,
+            started=state.started,
+            duration_s=state.duration_s,
+            checks=tuple(check.model_dump(mode="json") for check in state.checks),
+            versions=dict(run.versions) if run else {},
+        )
+
+
+def _given(loaded: LoadedScan, kind: type, store: ArtifactStore) -> Any:
+    row = loaded.given.get(kind.__name__)
+    return decode(row.document, kind, store) if row else None
+
+
+def _write_results(target: ExportFolder, content: _Content, store: ArtifactStore) -> None:
+    if content.cloud is not None:
+        target.write("cloud.ply", ply_parts(content.cloud))
+    for name, array in _maps(content.state, store):
+        target.write_array(f"maps/{name}.npy", array)
+
+
+def _maps(state: ScanState, store: ArtifactStore) -> Iterator[tuple[str, Array]]:
+    """Return every shown map of every present result, with its name."""
+    for stage in state.stages:
+        for field in stage.fields:
+            if field.hint["kind"] not in _MAPS:
+                continue
+            for camera, ref in field.arrays.items():
+                suffix = f".{safe_name(camera)}" if camera else ""
+                yield f"{stage.name}.{field.name}{suffix}", store.get(ref.hash)
+
+
+def _write_frames(
+    target: ExportFolder, content: _Content, store: ArtifactStore, progress: Progress | None
+) -> None:
+    assert content.facts is not None, "refused before anything is written"
+    write_capture(
+        target,
+        store,
+        content.loaded.method,
+        name=content.loaded.title,
+        facts=content.facts,
+        calibration=content.calibration,
+        journal=content.journal,
+        given=content.given,
+        progress=progress,
+    )
+
+
+def _written_given(
+    target: ExportFolder, content: _Content, name: str, store: ArtifactStore
+) -> WrittenGiven:
+    row = content.given[name]
+
+    def write(hash: str, array: Array) -> str:
+        target.write_array(f"given/{hash}.npy", array)
+        return f"given/{hash}.npy"
+
+    imported = name in content.loaded.method.importers
+    document = None if imported else written_out(row.document, store, write)
+    return WrittenGiven(type=row.type_name, hash=row.hash, document=document)
+
+
+def _written_settings(state: StageState) -> dict[str, WrittenSetting]:
+    return {
+        name: WrittenSetting(value=view.value, source=view.source, chosen=view.chosen)
+        for name, view in state.settings.items()
+    }
+
+
+def _written_decision(row: DecisionRow) -> WrittenDecision:
+    return WrittenDecision(
+        stage=row.stage,
+        key=row.key,
+        verdict=row.verdict.value,
+        reason=row.reason,
+        who=row.who,
+        when=row.when,
+    )
+
+
+def _written_edit(row: EditRow) -> WrittenEdit:
+    return WrittenEdit(
+        revision=row.revision,
+        stage=row.stage,
+        field=row.field,
+        old=row.old,
+        new=row.new,
+        kind=row.kind.value,
+        reason=row.reason,
+        who=row.who,
+        when=row.when,
+    )
+
+
+def _written_audit(row: AuditRow) -> WrittenAudit:
+    return WrittenAudit(
+        when=row.when, who=row.who, action=row.action, stage=row.stage, sentence=row.sentence
+    )
+
+
+def _second(moment: datetime) -> datetime:
+    return moment.replace(microsecond=0)

@@ -1,0 +1,157 @@
+"""What a scan is worth: points, times, and against the truth where the rig knows it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from backend.devices.protocols import KnowsTruth, Rig
+from backend.domain.errors import RigBusyError
+from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
+from backend.jobs.plan import PlannedStage
+from backend.numerics.scoring import DEFINITION, Score, Scores, Truth, score
+from backend.services.context import Context
+from backend.stages.cloud import Cloud
+from backend.storage.codec import decode
+from backend.storage.repositories import Repositories
+from backend.storage.rows import GivenRow, RunRow
+
+DEFINITION_OF_FIGURES = DEFINITION
+"""How completeness and error are counted, for the help of whatever shows them."""
+
+
+@dataclass(frozen=True)
+class ScanReport:
+    """Figures of one scan."""
+
+    points: int | None
+    """None: the scan has no cloud (yet)."""
+    median_sigma_mm: float | None
+    """Predicted uncertainty that half of the points stay below."""
+    duration_s: float
+    """All present results together."""
+    light_s: float | None
+    """Exposure time of one camera's frames, if a stage tells."""
+    scores: Scores | None
+    """None: nobody knows the truth."""
+
+    def document(self) -> dict[str, Any]:
+        """Write the figures as JSON values; what can't be said is None."""
+        return {
+            "points": self.points,
+            "median_sigma_mm": _number(self.median_sigma_mm),
+            "duration_s": round(self.duration_s, 3),
+            "light_s": _number(self.light_s),
+            **truth_document(self.scores),
+        }
+
+
+def truth_document(scores: Scores | None) -> dict[str, Any]:
+    """Write scores as `truth` and `parts`; nothing where nobody knows the truth."""
+    if scores is None:
+        return {}
+    total = _score_document(scores.total) | {
+        "edge_base": scores.edge_base,
+        "edge_accepted": scores.edge_accepted,
+        "stray": scores.stray,
+        "definition": DEFINITION,
+    }
+    return {
+        "truth": total,
+        "parts": {name: _score_document(part) for name, part in scores.parts.items()},
+    }
+
+
+def _score_document(figures: Score) -> dict[str, Any]:
+    return {name: _number(value) for name, value in figures._asdict().items()}
+
+
+def _number(value: float | None) -> float | int | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return value if isinstance(value, int) else round(value, 6)
+
+
+def report(context: Context, scan: str) -> ScanReport:
+    """Collect the figures of a scan's present results; asks the rig for the truth if it knows it."""
+    with context.database.reading() as repositories:
+        loaded = load_scan(repositories, context.registry, scan)
+        cloud = load_cloud(context, repositories, loaded)
+        light_s = _light_s(repositories, loaded)
+    runs = [planned.run for planned in loaded.plan.stages if planned.run]
+    return ScanReport(
+        points=cloud.point_count if cloud else None,
+        median_sigma_mm=cloud.median_sigma_mm if cloud else None,
+        duration_s=sum(run.duration_s or 0.0 for run in runs),
+        light_s=light_s,
+        scores=_scores(context, loaded, cloud) if cloud else None,
+    )
+
+
+def load_cloud(context: Context, repositories: Repositories, loaded: LoadedScan) -> Cloud | None:
+    """Return the last cloud of a scan, mapped; None if there is none."""
+    planned = cloud_stage(loaded)
+    if planned is None or planned.result is None:
+        return None
+    document = document_of(repositories, planned.result)
+    cloud: Cloud = decode(document, Cloud, context.store)
+    return cloud
+
+
+def cloud_stage(loaded: LoadedScan) -> PlannedStage | None:
+    """Return the last stage that makes a cloud; None if the method has none."""
+    for planned in reversed(loaded.plan.stages):
+        if planned.stage.output is Cloud:
+            return planned
+    return None
+
+
+def document_of(repositories: Repositories, result: RunRow | GivenRow) -> Mapping[str, Any]:
+    """Return a result's document, which plans come without."""
+    if isinstance(result, GivenRow):
+        return result.document
+    document = repositories.runs.get(result.id).document
+    assert document is not None, "a plan's present runs are finished"
+    return document
+
+
+def compare_with_truth(cloud: Cloud, truth: Truth) -> Scores | None:
+    """Score a cloud; None where its points aren't one per pixel, which is what the truth is known for."""
+    x, y = cloud.pixel_x, cloud.pixel_y
+    if not (np.array_equal(x, np.round(x)) and np.array_equal(y, np.round(y))):
+        return None
+    return score(cloud.points_mm, x.astype(np.int64), y.astype(np.int64), truth)
+
+
+def rig_truth(
+    context: Context, loaded: LoadedScan, reference: str, cameras: tuple[str, ...]
+) -> Truth | None:
+    """Ask the scan's rig for the truth; None if it has no rig, the rig doesn't know, or it is busy otherwise."""
+    if loaded.row.rig == NO_RIG:
+        return None
+
+    def ask(rig: Rig) -> Truth | None:
+        return rig.truth(reference, cameras or None) if isinstance(rig, KnowsTruth) else None
+
+    try:
+        return context.rigs.use(loaded.row.rig, loaded.row.rig_options, ask)
+    except RigBusyError:
+        return None
+
+
+def _scores(context: Context, loaded: LoadedScan, cloud: Cloud) -> Scores | None:
+    reference = cloud.cameras[0] if cloud.cameras else next(iter(cloud.depth_mm))
+    truth = rig_truth(context, loaded, reference, cloud.cameras)
+    return compare_with_truth(cloud, truth) if truth else None
+
+
+def _light_s(repositories: Repositories, loaded: LoadedScan) -> float | None:
+    """Sum the exposures of one camera's frames, from the journal of the present takes."""
+    takes = {(p.name, p.take) for p in loaded.plan.stages if p.stage.captures}
+    frames = [f for f in repositories.frames.of_scan(loaded.row.id) if (f.stage, f.take) in takes]
+    if not frames:
+        return None
+    cameras = {f.camera for f in frames}
+    return sum(float(f.metadata["exposure_us"]) for f in frames) / 1e6 / len(cameras)
