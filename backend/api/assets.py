@@ -15,7 +15,6 @@ PUBLIC = {
     "login.js": "text/javascript; charset=utf-8",
     "logo.svg": "image/svg+xml",
     "theme.css": "text/css; charset=utf-8",
-    "theme.json": "application/json",
 }
 """Files that anybody may fetch, with their media types; nothing in them is secret."""
 
@@ -35,3 +34,13 @@ def filled(page: str, /, **values: str) -> str:
     """Fill a page's `$placeholders`; every value is escaped, so none can bring markup along."""
     template = Template(asset(page)[0].decode("utf-8"))
     return template.substitute({key: html.escape(value) for key, value in values.items()})
+
+
+@lru_cache(maxsize=1)
+def help_page() -> str:
+    """Return the operators' help as a page."""
+    from markdown_it import MarkdownIt  # only when somebody asks for help
+
+    text = asset("help.md")[0].decode("utf-8")
+    body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
+    return asset("help.html")[0].decode("utf-8").replace("$body", body)

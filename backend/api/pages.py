@@ -6,9 +6,10 @@ from fastapi import APIRouter, Request
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
 from backend.api.access import address_of, same_origin, session_of
-from backend.api.assets import PUBLIC, asset, filled
+from backend.api.assets import PUBLIC, asset, filled, help_page
 from backend.api.context import Context, context_of
 from backend.api.errors import NotLoggedInError, TooManyAttemptsError
+from backend.api.headers import FRAMED_BY_US
 from backend.api.sessions import LONGEST_NAME, tidy_name
 from backend.domain.errors import NotFoundError, RefusedError
 
@@ -101,6 +102,12 @@ async def import_form(request: Request) -> Response:
         return login_page_for(request)
     limit = context_of(request).upload_limit_bytes
     return HTMLResponse(filled("import.html", user=session.user, limit=f"{limit / 2**20:,.0f} MiB"))
+
+
+@router.get("/help")
+def operators_help() -> Response:
+    """Show the operators' help, also to somebody who can't get in yet, and inside the station."""
+    return HTMLResponse(help_page(), headers=FRAMED_BY_US)
 
 
 @router.get("/assets/{name}")

@@ -282,6 +282,14 @@ def test_the_description_of_the_api_is_for_whoever_is_logged_in(
     assert "<script" not in page.text
 
 
+def test_help_is_there_for_everybody(stranger: httpx.Client) -> None:
+    page, text = stranger.get("/help"), stranger.get("/assets/help.md")
+
+    assert "<h2>Keys</h2>" in page.text
+    assert "<table>" in page.text
+    assert text.headers["content-type"] == "text/markdown; charset=utf-8"
+
+
 def test_the_way_out_is_asked_for_by_name(address: str) -> None:
     with browser(address, name="Ada <b>") as client:
         page = client.get("/logout").text
@@ -310,6 +318,7 @@ PUBLIC = {
     "/login/who",
     "/logout",
     "/import",
+    "/help",
     "/assets/{name}",
     "/station",
     "/station/{path:path}",
