@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request
 from starlette.responses import Response, StreamingResponse
 
+from backend.api.binary import binary
 from backend.api.context import Uses, context_of
 from backend.api.npy import npy_chunks, npy_size_bytes
 from backend.contract.base import Message
@@ -23,12 +24,6 @@ class PixelValue(Message):
 
     value: Any
     """A number, a list for several channels, None where nothing is valid."""
-
-
-def binary(media_type: str) -> dict[int | str, dict[str, Any]]:
-    """Describe an answer that is bytes, for OpenAPI."""
-    schema = {"type": "string", "format": "binary"}
-    return {200: {"content": {media_type: {"schema": schema}}, "description": "The bytes."}}
 
 
 @router.get("/artifacts/{hash}", response_class=Response, responses=binary("application/x-npy"))

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Body, Path
 from starlette.responses import Response
 
-from backend.api.artifacts import binary
+from backend.api.binary import binary
 from backend.api.context import Uses
 from backend.api.scans import ScanId
 from backend.contract.rigs import RigCheck, RigOffer, RigView

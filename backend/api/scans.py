@@ -1,10 +1,13 @@
 """Methods, scans, runs and decisions; every change answers with the scan's whole state."""
 
+import itertools
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query
+from starlette.responses import Response, StreamingResponse
 
 from backend.api.access import Who
+from backend.api.binary import binary
 from backend.api.context import Uses
 from backend.contract.descriptions import MethodList
 from backend.contract.requests import (
@@ -109,3 +112,15 @@ def export_scan(scan: ScanId, request: ExportScan, services: Uses, who: Who) -> 
     """Write results into a folder of the server; answers with the files written."""
     paths = services.export(scan, request.folder, request.frames, who.user)
     return tuple(str(path) for path in paths)
+
+
+@router.get("/scans/{scan}/cloud.ply", response_class=Response, responses=binary("model/ply"))
+def cloud_file(scan: ScanId, services: Uses) -> Response:
+    """Return the scan's points as a PLY file (binary, mm)."""
+    parts = services.cloud_ply(scan)
+    # The first piece now: what hinders it becomes an answer, not half a file.
+    whole = itertools.chain([next(parts)], parts)
+    headers = {"Content-Disposition": f'attachment; filename="{scan}.ply"'}
+    return StreamingResponse(
+        (bytes(part) for part in whole), media_type="model/ply", headers=headers
+    )

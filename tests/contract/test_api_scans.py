@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -342,6 +343,40 @@ def test_only_the_scalar_asked_for(client: httpx.Client, finished: dict[str, Any
     assert client.get(address, params={"scalar": "height_mm"}).status_code == 200
     assert client.get(address, params={"scalar": "weight"}).status_code == 404
     assert client.get(address, params={"budget": 1}).status_code == 422
+
+
+def test_a_cloud_file_is_sent_in_pieces(
+    place: tuple[str, House],
+    client: httpx.Client,
+    finished: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parts = [b"ply\n", memoryview(b"points")]
+    monkeypatch.setattr(place[1].services, "cloud_ply", lambda scan: iter(parts))
+
+    answer = client.get(f"/api/scans/{finished['id']}/cloud.ply")
+
+    assert answer.content == b"ply\npoints"
+    assert answer.headers["content-type"] == "model/ply"
+    assert answer.headers["content-disposition"] == f'attachment; filename="{finished["id"]}.ply"'
+
+
+def test_a_scan_without_cloud_has_no_file(client: httpx.Client) -> None:
+    answer = client.get(f"/api/scans/{create(client)['id']}/cloud.ply")
+
+    assert (answer.status_code, answer.json()["type"]) == (409, "conflict")
+
+
+def test_an_export_names_its_files(
+    client: httpx.Client, finished: dict[str, Any], tmp_path: Path
+) -> None:
+    answer = client.post(
+        f"/api/scans/{finished['id']}/export", json={"folder": str(tmp_path / "out")}
+    )
+
+    assert answer.status_code == 200, answer.text
+    assert str(tmp_path / "out" / "scan.json") in answer.json()
+    assert all(Path(file).is_file() for file in answer.json())
 
 
 # ---- rigs, health, metrics
