@@ -97,7 +97,7 @@ def _interpolated(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     if columns.size == 0:
         return np.full(values.size, np.nan)
     order = columns[np.argsort(known[columns])]
-    return np.interp(values, known[order], order)
+    return np.asarray(np.interp(values, known[order], order))
 
 
 def numpy_triangulate(u: np.ndarray, K: np.ndarray, P: np.ndarray) -> np.ndarray:
@@ -106,7 +106,7 @@ def numpy_triangulate(u: np.ndarray, K: np.ndarray, P: np.ndarray) -> np.ndarray
     ray = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
     normal = P[0, :3] - u[..., None] * P[2, :3]
     depth = (u * P[2, 3] - P[0, 3]) / (ray * normal).sum(axis=-1)
-    return ray * depth[..., None]
+    return np.asarray(ray * depth[..., None])
 
 
 def report(name: str, value_ms: float, copy_ms: float, note: str = "") -> None:

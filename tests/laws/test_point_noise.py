@@ -6,14 +6,15 @@ import pytest
 from backend.numerics.camera_model import compose, inverse
 from backend.numerics.matching import match
 from backend.numerics.rectification import rectify
-from backend.numerics.triangulation import triangulate_pair, triangulate_projector
+from backend.numerics.triangulation import Cloud, triangulate_pair, triangulate_projector
 from tests.surfaces import LEFT, PROJECTOR, RIGHT, camera, plane, projector, step, view
 
 
-def along_ray(cloud, truth):
+def along_ray(cloud: Cloud, truth: np.ndarray) -> np.ndarray:
     """Signed error along each pixel's ray."""
     length = np.linalg.norm(truth, axis=2)
-    return (np.linalg.norm(cloud.points_mm, axis=2) - length)[np.isfinite(cloud.points_mm[..., 2])]
+    error = np.linalg.norm(cloud.points_mm, axis=2) - length
+    return np.asarray(error[np.isfinite(error)])
 
 
 @pytest.mark.parametrize("swap", [False, True])

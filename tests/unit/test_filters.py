@@ -13,16 +13,16 @@ from backend.numerics.filters import (
     without_outliers,
     without_specks,
 )
-from tests.surfaces import LEFT, camera, plane, sphere, step, view
+from tests.surfaces import LEFT, Surface, camera, plane, sphere, step, view
 
 ANGLE = pixel_angle(camera().K)
 SIGMA = 0.03
 
 
-def noisy_cloud(surface, seed=0):
+def noisy_cloud(surface: Surface, seed: int = 0) -> np.ndarray:
     points = view(surface, camera(), LEFT).points_mm
     depth_noise = np.random.default_rng(seed).normal(scale=SIGMA, size=points.shape[:2])
-    return (points * (1 + depth_noise / points[..., 2])[..., None]).astype(np.float32)
+    return np.asarray(points * (1 + depth_noise / points[..., 2])[..., None], np.float32)
 
 
 @pytest.mark.parametrize("surface", [plane, sphere, step])

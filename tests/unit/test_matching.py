@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from backend.numerics.camera_model import Pinhole, RigidTransform, compose, inverse
 from backend.numerics.errors import MatchingError
-from backend.numerics.matching import match, sample_partner
+from backend.numerics.matching import Matches, match, sample_partner
 from backend.numerics.reasons import Reason
 from backend.numerics.rectification import rectify
 from backend.numerics.triangulation import triangulate_pair
@@ -28,7 +28,7 @@ ASIDE = rectify(STRAIGHT, STRAIGHT, RigidTransform(np.eye(3), np.array([-20.0, 0
 """Two equal cameras side by side: partners lie in the same row of pixels."""
 
 
-def rows_of(values):
+def rows_of(values: np.ndarray) -> np.ndarray:
     return np.tile(np.asarray(values, np.float32), (HEIGHT, 1))
 
 
@@ -37,9 +37,9 @@ SHIFTED = rows_of(10 + 1.25 * (np.arange(WIDTH) + SHIFT))
 """What the right camera sees of a plane: everything `SHIFT` px further left."""
 
 
-def columns(matches):
+def columns(matches: Matches) -> np.ndarray:
     """Columns of the other camera, as these cameras' rectified x is the column minus 31.5."""
-    return matches.x_other_px + 31.5
+    return np.asarray(matches.x_other_px + 31.5)
 
 
 @given(

@@ -15,8 +15,8 @@ from tests.surfaces import (
 )
 
 
-def angles_deg(found, truth):
-    return np.degrees(np.arccos(np.clip((found * truth).sum(axis=-1), -1, 1)))
+def angles_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.asarray(np.degrees(np.arccos(np.clip((found * truth).sum(axis=-1), -1, 1))))
 
 
 def test_plane_has_its_normal_everywhere_through_a_distorting_lens():

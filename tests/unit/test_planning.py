@@ -29,7 +29,7 @@ FREE = ExposureGrid(0.05, 2000.0)
 DLP = ExposureGrid(0.05, 2000.0, period_ms=1000 / 120)
 
 
-def scene(seed=0):
+def scene(seed: int = 0) -> RateHistogram:
     rng = np.random.default_rng(seed)
     body = 0.85 * np.sqrt(rng.uniform(0.05, 1, 60_000))
     blocks, book = 0.36 * rng.lognormal(0, 0.2, 20_000), 0.05 * rng.lognormal(0, 0.15, 30_000)
@@ -138,12 +138,13 @@ def test_saturated_and_starved_light_is_not_served():
 @pytest.mark.parametrize(("count", "budget_s"), [(1, 3.0), (2, 1.5), (2, 6.0), (3, 3.0)])
 def test_plan_is_the_best_of_all_sets(fusion, count, budget_s):
     """Against every set on a coarse exposure grid."""
-    grid = ExposureGrid(0.05, 2000.0, period_ms=100 / 3)
+    period_ms = 100 / 3
+    grid = ExposureGrid(0.05, 2000.0, period_ms)
     plan = plan_exposures(
         SCENE, NOISE, grid, budget_s=budget_s, count_range=(count, count), fusion=fusion
     )
-    frames = int(budget_s * 1000 / 12 / grid.period_ms)
-    times = grid.period_ms * np.arange(1, min(frames, 22) + 1)
+    frames = int(budget_s * 1000 / 12 / period_ms)
+    times = period_ms * np.arange(1, min(frames, 22) + 1)
     sets = [s for s in combinations(times, count) if sum(s) * 12 <= budget_s * 1000]
     best = min(predict(SCENE, np.array(s), NOISE, fusion=fusion).cost for s in sets)
     assert plan.chosen.time_s <= budget_s * (1 + 1e-9)

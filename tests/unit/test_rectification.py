@@ -5,20 +5,27 @@ from hypothesis import strategies as st
 
 from backend.numerics.camera_model import RigidTransform, compose, inverse, project, rays
 from backend.numerics.errors import CalibrationError
-from backend.numerics.rectification import rectify
+from backend.numerics.rectification import Canvas, rectify
 from tests.surfaces import camera, looking_from
 
 
-def on_canvas(xy, canvas):
+def on_canvas(xy: np.ndarray, canvas: Canvas) -> np.ndarray:
     x, y = xy[:, 0] - canvas.x0_px, xy[:, 1] - canvas.y0_px
-    return (x >= 0) & (x <= canvas.width_px - 1) & (y >= 0) & (y <= canvas.height_px - 1)
+    return np.asarray(
+        (x >= 0) & (x <= canvas.width_px - 1) & (y >= 0) & (y <= canvas.height_px - 1)
+    )
 
 
-def rectified(points, device_from_reference, turn_from_reference, focal):
+def rectified(
+    points: np.ndarray,
+    device_from_reference: RigidTransform,
+    turn_from_reference: np.ndarray,
+    focal: float,
+) -> np.ndarray:
     """Project points, given in the reference frame, onto a device's rectified plane."""
     centre = inverse(device_from_reference).t_mm
     turned = (points - centre) @ turn_from_reference.T
-    return focal * turned[:, :2] / turned[:, 2:]
+    return np.asarray(focal * turned[:, :2] / turned[:, 2:])
 
 
 @given(
@@ -82,7 +89,7 @@ def test_lattices_agree_with_the_camera_model(swap):
 
 
 def test_wide_convergence_gets_a_coarser_canvas_not_a_larger_one():
-    def rig(x_mm):
+    def rig(x_mm: float) -> RigidTransform:
         return looking_from(x_mm, 0, target_mm=200)
 
     wide = camera(640, 480, lens=())._replace(

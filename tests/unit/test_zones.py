@@ -7,24 +7,26 @@ from backend.numerics.errors import HistogramError, ZoneError
 from backend.numerics.zones import ZoneSettings, find_zones, zone_shares, zones_from_valleys
 
 
-def counted(gray, full_scale=255, background=3):
+def counted(gray: np.ndarray, full_scale: int = 255, background: int = 3) -> np.ndarray:
     gray = np.clip(np.round(gray * full_scale / 255), 0, full_scale).astype(int)
     counts = np.bincount(gray, minlength=full_scale + 1).astype(float)
     counts[: background * full_scale // 255] = 0
     return counts
 
 
-def hill(rng, peak, sigma, pixels):
+def hill(rng: np.random.Generator, peak: float, sigma: float, pixels: float) -> np.ndarray:
     return rng.normal(peak, sigma, int(pixels))
 
 
-def high_contrast(seed, *, plaster=200_000, blocks=60_000, book=100_000, flat=0):
+def high_contrast(
+    seed: int, *, plaster: int = 200_000, blocks: int = 60_000, book: int = 100_000, flat: int = 0
+) -> np.ndarray:
     """A shaded bright body (triangular histogram), some blocks' faces, a dark cover, a flat bright wall."""
     rng = np.random.default_rng(seed)
     body = 230 * np.sqrt(1 - rng.uniform(0, 0.9, plaster))
     faces = [hill(rng, m, rng.uniform(1.5, 6), blocks // 4) for m in rng.uniform(70, 105, 4)]
     cover = hill(rng, 13, rng.uniform(0.8, 3), book)
-    return np.concatenate([body, *faces, cover, hill(rng, 222, 1.5, flat)]) + 2
+    return np.asarray(np.concatenate([body, *faces, cover, hill(rng, 222, 1.5, flat)]) + 2)
 
 
 @pytest.mark.parametrize("full_scale", [255, 4095])
