@@ -18,7 +18,7 @@ Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def plane(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
     normal = PLANE_NORMAL
-    return ((np.array([0.0, 0.0, 700.0]) - origin) @ normal) / (directions @ normal)
+    return np.asarray(((np.array([0.0, 0.0, 700.0]) - origin) @ normal) / (directions @ normal))
 
 
 PLANE_NORMAL = np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
@@ -29,13 +29,15 @@ def sphere(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
     offset = origin - SPHERE_CENTRE
     a, b = (directions**2).sum(axis=1), directions @ offset
     with np.errstate(invalid="ignore"):
-        return (-b - np.sqrt(b * b - a * (offset @ offset - SPHERE_RADIUS**2))) / a
+        root = np.sqrt(b * b - a * (offset @ offset - SPHERE_RADIUS**2))
+        return np.asarray((-b - root) / a)
 
 
 def step(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """A plate at 680 mm left of x = 3 mm, in front of a wall at 720 mm."""
     near, far = ((depth - origin[2]) / directions[:, 2] for depth in (680.0, 720.0))
-    return np.where((origin + near[:, None] * directions)[:, 0] < 3.0, near, far)
+    left_of_edge = (origin + near[:, None] * directions)[:, 0] < 3.0
+    return np.asarray(np.where(left_of_edge, near, far))
 
 
 def camera(width_px: int = 640, height_px: int = 480, lens: tuple[float, ...] = LENS) -> Pinhole:
