@@ -8,7 +8,7 @@ from backend.numerics.drift import smooth_drift
 
 def surface(height: int, width: int) -> np.ndarray:
     y, x = np.mgrid[0:height, 0:width]
-    return (0.4 - 0.8 * x / width + 0.5 * (y / height) ** 2).astype(np.float32)
+    return np.asarray(0.4 - 0.8 * x / width + 0.5 * (y / height) ** 2, np.float32)
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.5])

@@ -1,5 +1,7 @@
 """Captured fringes are sorted into complete sets, or refused with what is missing."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,11 @@ from backend.domain.errors import InvalidCaptureError
 from backend.domain.frames import Frame, InMemory
 from backend.domain.patterns import Gray, Sine, Uniform
 from backend.stages.fringe_sets import fringe_sets
+
+
+def pattern(frame: Frame) -> Any:
+    return frame.pattern
+
 
 PIXELS = InMemory(np.zeros((4, 6), np.uint8))
 
@@ -36,7 +43,7 @@ def test_frames_are_sorted_by_camera_axis_exposure_frequency_and_step():
     assert set(sets) == {("left", "x"), ("right", "y")}
     assert left.exposures_ms == (50.0, 400.0)
     for exposed in left.exposures:
-        found = [(f.pattern.periods, f.pattern.shift_rad) for f in exposed.sines]
+        found = [(pattern(f).periods, pattern(f).shift_rad) for f in exposed.sines]
         expected = [
             (p, s) for p, row in zip(left.periods, left.shifts_rad, strict=True) for s in row
         ]
@@ -53,7 +60,7 @@ def test_every_third_of_twelve_steps_is_a_four_step_set(first):
     (twelve,) = fringe_sets(sines(steps=12))
     four = twelve.subset(4, first)
     assert np.allclose(four.shifts_rad[1], 2 * np.pi * (np.arange(4) * 3 + first) / 12)
-    shifts = [f.pattern.shift_rad for f in four.exposures[0].sines[4:8]]
+    shifts = [pattern(f).shift_rad for f in four.exposures[0].sines[4:8]]
     assert np.allclose(shifts, four.shifts_rad[1])
 
 
@@ -70,7 +77,7 @@ def test_the_gray_code_comes_highest_bit_first_with_the_inverse_behind():
         for i in (True, False)
     ]
     (found,) = fringe_sets(sines() + grays)
-    order = [(f.pattern.bit, f.pattern.inverse) for f in found.exposures[0].grays]
+    order = [(pattern(f).bit, pattern(f).inverse) for f in found.exposures[0].grays]
     assert order == [(1, False), (1, True), (0, False), (0, True)]
 
 

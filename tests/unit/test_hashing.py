@@ -1,12 +1,14 @@
 """Keys: what changes a result changes the key, and nothing else does."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from backend.domain.hashing import document_hash, stage_key
 
-BASE = {
+BASE: dict[str, Any] = {
     "stage": "zones",
     "version": 1,
     "settings": {"sigma_gray": 3.5, "gap_gray": 8.0},

@@ -107,19 +107,23 @@ def test_cosmetic_settings_stay_out_of_the_key():
     assert without_cosmetics(AreaParams(colour="blue")) == {"factor": 2.0}
 
 
-def _no_docstring(width: Width) -> Area: ...
+def _no_docstring(width: Width) -> Area:
+    raise NotImplementedError
 
 
 def _unannotated(width) -> Area:
     """Have an input without type."""
+    raise NotImplementedError
 
 
 def _no_dataclass(width: Width) -> float:
     """Return no dataclass."""
+    raise NotImplementedError
 
 
 def _two_types(width: Width | Depth) -> Area:
     """Read one of two types."""
+    raise NotImplementedError
 
 
 @pytest.mark.parametrize(
