@@ -29,7 +29,7 @@ class Scene:
     ) -> list[np.ndarray]:
         """Take pictures with read and photon noise, rounded and clipped."""
         rng = np.random.default_rng(seed)
-        frames = []
+        frames: list[np.ndarray] = []
         for periods, shifts_rad in zip(code.periods, code.shifts_rad, strict=True):
             for shift_rad in shifts_rad:
                 light = exposure_ms * (

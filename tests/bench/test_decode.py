@@ -6,6 +6,7 @@ Ratios of the best of several interleaved rounds: neither a slow machine nor a b
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pytest
 from backend.numerics.absolute_phase import Limits, absolute_phase, decode_frames, empty_maps
 from backend.numerics.fringe_orders import cascade, maximum_likelihood
 from backend.numerics.gray_code import decode_gray_code
-from backend.numerics.patterns import gray_code_pattern
+from backend.numerics.patterns import Axis, gray_code_pattern
 from backend.numerics.phasors import fuse_exposures
 from backend.numerics.sine_code import SineCode
 from backend.numerics.uncertainty import NoiseModel
@@ -56,11 +57,11 @@ def best_ms(candidates: dict[str, Callable[[], object]], rounds: int = 15) -> di
     return best
 
 
-def report(benchmark: object, times: dict[str, float], run: Callable[[], object]) -> None:
+def report(benchmark: Any, times: dict[str, float], run: Callable[[], object]) -> None:
     """Hand the figures to pytest-benchmark's record, and print them."""
     figures = {name: round(value, 2) for name, value in times.items()}
-    benchmark.extra_info.update(figures)  # type: ignore[attr-defined]
-    benchmark.pedantic(run, rounds=3)  # type: ignore[operator]
+    benchmark.extra_info.update(figures)
+    benchmark.pedantic(run, rounds=3)
     print(figures)
 
 
@@ -151,7 +152,8 @@ def test_gray_code_of_44_frames_takes_at_most_three_copies(benchmark):
     columns = np.linspace(0, 1279.99, width).astype(int)
     rows = np.linspace(0, 799.99, height).astype(int)
     sets: dict[str, tuple[list[np.ndarray], list[np.ndarray]]] = {}
-    for axis, size, seen in (("x", 1280, columns), ("y", 800, rows)):
+    axes: tuple[tuple[Axis, int, np.ndarray], ...] = (("x", 1280, columns), ("y", 800, rows))
+    for axis, size, seen in axes:
         for inverse in (False, True):
             for bit in reversed(range(11)):
                 pattern = gray_code_pattern(

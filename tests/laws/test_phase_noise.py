@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from backend.numerics.absolute_phase import AbsolutePhase, Limits, absolute_phase, decode_frames
-from backend.numerics.fringe_orders import cascade, maximum_likelihood, stage_noise_gain
+from backend.numerics.fringe_orders import (
+    FringeOrders,
+    cascade,
+    maximum_likelihood,
+    stage_noise_gain,
+)
 from backend.numerics.phasors import Phasors, fuse_exposures, wrapped_phase_rad
 from backend.numerics.sine_code import SineCode
 from backend.numerics.uncertainty import (
@@ -43,7 +48,7 @@ def noisy_phasors(x: np.ndarray, ratio: float, seed: int, code: SineCode = CODE)
     )
 
 
-def decoded(x: np.ndarray, ratio: float, orders: object, seed: int) -> AbsolutePhase:
+def decoded(x: np.ndarray, ratio: float, orders: FringeOrders, seed: int) -> AbsolutePhase:
     return absolute_phase(
         noisy_phasors(x, ratio, seed), CODE, orders, size_px=SIZE_PX, limits=NO_LIMITS
     )
@@ -107,7 +112,7 @@ def test_order_failures_follow_theory(ratio, n_px):
     phasors = noisy_phasors(x, ratio, seed=ratio + 100)
     sigma = phase_sigma_rad(1.0, ratio, 4)
 
-    def failures(orders: object) -> float:
+    def failures(orders: FringeOrders) -> float:
         result = absolute_phase(phasors, CODE, orders, size_px=SIZE_PX, limits=NO_LIMITS)
         wrong = np.abs(result.projector_px - (x * SIZE_PX - 0.5)) > SIZE_PX / 200
         # Off the projector and so NaN: as wrong as on a wrong fringe.

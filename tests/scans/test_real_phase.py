@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +24,7 @@ NOISE = NoiseModel(read_gray=1.0, gray_per_e=0.0)
 
 def load(
     path: str, kind: str = "sine", axis: str = "x"
-) -> tuple[list[np.ndarray], list[dict], dict]:
+) -> tuple[list[np.ndarray], list[dict[str, Any]], dict[str, Any]]:
     """Read the frames of one kind and axis in the order of the folder's description."""
     file = Path(os.environ["UNGLARE_DATA"]) / path
     document = json.loads(file.read_text())
@@ -31,9 +32,10 @@ def load(
         entry for entry in document["frames"]
         if entry["pattern"]["kind"] == kind and entry["pattern"]["axis"] == axis
     ]  # fmt: skip
-    frames = []
+    frames: list[np.ndarray] = []
     for entry in entries:
         picture = cv2.imread(str(file.parent / entry["file"]), cv2.IMREAD_UNCHANGED)
+        assert picture is not None, entry["file"]
         if picture.ndim == 3:
             picture = np.rint(picture.mean(axis=2)).astype(np.uint8)
         frames.append(picture)
@@ -79,9 +81,9 @@ def decoded(
     path: str, axis: str = "x", *, take: slice = slice(None), way: str = "likelihood"
 ) -> AbsolutePhase:
     code, frames, size_px = fringes(path, axis, take=take)
-    prepare = {"likelihood": maximum_likelihood, "cascade": cascade}[way]
+    orders = cascade(code.periods) if way == "cascade" else maximum_likelihood(code.periods)
     return decode_frames(
-        frames, code, prepare(code.periods), size_px=size_px, saturation_gray=253,
+        frames, code, orders, size_px=size_px, saturation_gray=253,
         limits=Limits(min_modulation_gray=10.0 if "board" in path else 8.0, max_residual_cycles=1.0, guard_band=0.0),
     )  # fmt: skip
 

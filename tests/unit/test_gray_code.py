@@ -161,7 +161,7 @@ def test_camera_pixels_that_see_one_projector_pixel_are_averaged():
     rows = np.array([[1, 1, 0, 0], [1, -1, 0, 3]], dtype=np.int32)
     seen = distinct_projector_pixels(columns, rows, width_px=8, height_px=4)
     assert seen.projector_px.tolist() == [[2, 0], [5, 1], [2, 3]]
-    assert np.allclose(seen.camera_px, [[2.5, 0.5], [1 / 3, 1 / 3], [3, 1]])
+    assert np.allclose(seen.camera_px, np.array([[2.5, 0.5], [1 / 3, 1 / 3], [3.0, 1.0]]))
     assert seen.n_camera_px.tolist() == [2, 3, 1]
     assert np.allclose(seen.spread_px, [np.sqrt(0.5), 2 / 3, 0])
 

@@ -1,14 +1,22 @@
 import subprocess
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from backend.numerics import decoding_kernels, fusion_kernels
+from backend.numerics.absolute_phase import absolute_phase, decode_frames
 from backend.numerics.errors import FrameError
+from backend.numerics.fringe_orders import cascade, code_aided, maximum_likelihood
 from backend.numerics.gray_code import decode_gray_code
 from backend.numerics.kernels import frame_stack, kernel_input
+from backend.numerics.phasors import Phasors, fuse_exposures, sinusoid_misfit
+from backend.numerics.sine_code import SineCode
+from backend.numerics.uncertainty import NoiseModel
 
 
 def test_frames_are_taken_where_they_lie():
@@ -132,3 +140,38 @@ def test_importing_the_package_does_not_import_numba():
         check=True,
     )
     assert answer.stdout.strip() == "False"
+
+
+def test_after_the_warm_up_no_kind_of_input_compiles_anything(tmp_path: Path):
+    for name in ("absolute_phase", "phasors", "gray_code"):
+        import_module(f"backend.numerics.{name}").warm_up_kernels()
+    kernels: tuple[Any, ...] = (
+        decoding_kernels.decode_frames,
+        decoding_kernels.locate_phasors,
+        fusion_kernels.fuse_exposures,
+        fusion_kernels.sinusoid_misfit,
+    )
+    code = SineCode(
+        (3.0, 4.0, 5.0), ((0.0, 1.0, 2.5, 4.0, 5.0), (0.0, 2.0, 4.0), (0.0, 1.0, 2.0, 3.0))
+    )
+    rng = np.random.default_rng(4)
+    np.save(tmp_path / "frames.npy", rng.integers(0, 4096, (12, 6, 7), dtype=np.uint16))
+    frames = list(np.load(tmp_path / "frames.npy", mmap_mode="r"))
+    noise = NoiseModel(read_gray=1.0, gray_per_e=0.1)
+    phasors = fuse_exposures(
+        [frames, frames], code, exposure_ms=[1.0, 2.0], noise=noise, saturation_gray=float("inf"),
+        strategy="masks", exposure_index=np.zeros((6, 7), np.uint8),
+    )  # fmt: skip
+    for name, plane in phasors._asdict().items():
+        np.save(tmp_path / f"{name}.npy", plane)
+    mapped = Phasors(
+        *(np.load(tmp_path / f"{name}.npy", mmap_mode="r") for name in Phasors._fields)
+    )
+    coarse_px = np.zeros((6, 7), np.float32)
+    absolute_phase(mapped, code, maximum_likelihood(code.periods), size_px=64, with_margin=True)
+    absolute_phase(mapped, code, code_aided(code.periods, codes=8), size_px=64, coarse_px=coarse_px)
+    decode_frames(
+        frames, code, cascade(code.periods), size_px=64, saturation_gray=4094, noise=noise
+    )
+    sinusoid_misfit(frames, code)
+    assert [len(kernel.signatures) for kernel in kernels] == [1, 1, 1, 1]
