@@ -213,7 +213,7 @@ class _Encoder:
             raise TypeError(f"{path} is {value!r}; annotate it with its enumeration")
         if isinstance(value, np.generic):
             value = value.item()
-        wanted = shape.origin or _SCALARS + (type(None),)  # noqa: RUF005 (shorter)
+        wanted = shape.origin or (*_SCALARS, type(None))
         if wanted is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         exact = type(value) is bool if wanted is bool else isinstance(value, wanted)

@@ -1,4 +1,8 @@
-"""Migrations without an `alembic.ini`: the scripts are part of the package."""
+"""Migrations without an `alembic.ini`: the scripts are part of the package.
+
+A new one: change `tables.py`, copy the newest file of `migrations/versions` under the next number, and write
+both ways. `tests/contract/test_migrations.py` lists what it still lacks, on both databases.
+"""
 
 from pathlib import Path
 

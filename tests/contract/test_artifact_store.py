@@ -12,6 +12,7 @@ import pickle
 import random
 import resource
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -476,6 +477,28 @@ def test_a_file_taken_for_a_leftover_before_its_lock_is_made_again(
     monkeypatch.setattr(fcntl, "flock", lock_after_a_cleaner)
     meta = store.put(np.arange(10))
     store.verify(meta.hash)
+
+
+def test_content_reaches_the_disk_before_its_name_and_the_name_before_put_returns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = LocalArtifactStore(tmp_path)
+    done: list[str] = []
+    fsync, replace = os.fsync, Path.replace
+
+    def note_fsync(handle: int) -> None:
+        is_folder = stat.S_ISDIR(os.fstat(handle).st_mode)
+        done.append(os.readlink(f"/proc/self/fd/{handle}") if is_folder else "content")
+        fsync(handle)
+
+    def note_replace(source: Path, target: Path) -> Path:
+        done.append("rename")
+        return replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", note_fsync)
+    monkeypatch.setattr(Path, "replace", note_replace)
+    folder = store.path(store.put(np.arange(10)).hash).parent
+    assert done == ["content", "rename", str(folder), str(store.root)]
 
 
 # --- start ----------------------------------------------------------------------------------------------

@@ -4,6 +4,8 @@
 then renamed: under its final name it is always whole, whenever the process or the power dies.
 """
 
+# ruff: noqa: D102 - ArtifactStore has the docstrings of its methods
+
 import contextlib
 import errno
 import fcntl
@@ -67,7 +69,7 @@ class LocalArtifactStore:
         _remove_leftovers(self.root / _PARTIAL)
         _allow_many_mappings()
 
-    def put(self, array: Array) -> ArtifactMeta:  # noqa: D102 (see ArtifactStore)
+    def put(self, array: Array) -> ArtifactMeta:
         if (known := self._known_mapping(array)) is not None:
             return known
         array = storable(array)
@@ -82,7 +84,7 @@ class LocalArtifactStore:
                 self._publish(partial, meta)
         return meta
 
-    def get(self, hash: str) -> Array:  # noqa: D102
+    def get(self, hash: str) -> Array:
         with self._open(hash) as (file, header):
             if header.size_bytes < _MAPPED_BYTES:
                 array = np.fromfile(file, header.dtype).reshape(header.shape)
@@ -94,11 +96,11 @@ class LocalArtifactStore:
         # A plain view: numpy's own class slows every slice down and numba's dispatch with it.
         return mapped.view(np.ndarray)
 
-    def meta(self, hash: str) -> ArtifactMeta:  # noqa: D102
+    def meta(self, hash: str) -> ArtifactMeta:
         with self._open(hash) as (_, header):
             return ArtifactMeta(hash, header.shape, header.dtype.str, header.size_bytes)
 
-    def verify(self, hash: str) -> None:  # noqa: D102
+    def verify(self, hash: str) -> None:
         if _digest(self.get(hash)) != hash:
             raise _corrupt(hash, "its content has changed")
 
@@ -113,12 +115,12 @@ class LocalArtifactStore:
     def __contains__(self, hash: str) -> bool:
         return is_hash(hash) and self.path(hash).is_file()
 
-    def hashes(self) -> Iterator[str]:  # noqa: D102
+    def hashes(self) -> Iterator[str]:
         for file in self.root.glob("[0-9a-f][0-9a-f]/*.npy"):
             if is_hash(found := file.parent.name + file.stem):
                 yield found
 
-    def delete(self, hash: str) -> None:  # noqa: D102
+    def delete(self, hash: str) -> None:
         self.path(hash).unlink(missing_ok=True)
 
     def _known_mapping(self, array: Array) -> ArtifactMeta | None:
