@@ -17,7 +17,10 @@ from backend.domain.errors import UnglareError
 
 GROUP = "unglare.rigs"
 
-_REQUIRED = ("name", "info", "cameras", "projector", "open", "close", "facts", "calibration")
+_REQUIRED = (
+    *("name", "info", "cameras", "projector", "facts", "calibration"),
+    *("open", "close", "__enter__", "__exit__"),
+)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """The simulated rig passes the suite that hardware passes."""
 
+from collections.abc import Mapping
+
 import pytest
 
 from backend.devices.conformance import RigConformance
@@ -10,7 +12,7 @@ SMALL = {"size": "160x120", "projector_size": "160x100"}
 
 class _Simulated(RigConformance):
     has_light = True
-    options: dict = {}
+    options: Mapping[str, object] = {}
 
     @pytest.fixture
     def rig(self):

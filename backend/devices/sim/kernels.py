@@ -23,8 +23,7 @@ _TABLE_SIZE = 4096
 def _normal_table() -> Float32[np.ndarray, "n"]:
     """Return normal quantiles whose sum of two independent draws has variance 1."""
     table = ndtri((np.arange(_TABLE_SIZE) + 0.5) / _TABLE_SIZE)
-    scaled: Float32[np.ndarray, n] = (table / table.std() / np.sqrt(2.0)).astype(np.float32)
-    return scaled
+    return np.asarray(table / table.std() / np.sqrt(2.0), np.float32)
 
 
 NORMAL = _normal_table()

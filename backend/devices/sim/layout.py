@@ -23,8 +23,7 @@ class View:
     @property
     def position_mm(self) -> Float[np.ndarray, "3"]:
         """Centre of projection in the rig's frame, in [mm]."""
-        position: Float[np.ndarray, 3] = -self.device_from_rig.R.T @ self.device_from_rig.t_mm
-        return position
+        return np.asarray(-self.device_from_rig.R.T @ self.device_from_rig.t_mm)
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ A table is a JSON file, or a YAML file where PyYAML is installed::
 
 Lengths in the file times `unit_mm` are mm. With `centre` the middle of the bounding box is put where the
 devices look; then the mesh is turned about x, y, z and moved. `materials` goes by the names of the objects
-in the file; `*` is for all others.
+in the file (in an OBJ file of materials, groups or objects, whichever was named last); `*` is for all others.
 """
 
 import importlib
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -106,26 +107,69 @@ _Object = tuple[
 def _read_objects(path: Path) -> list[_Object]:
     if not path.is_file():
         raise RigConfigError(f"mesh file {path} isn't there; check the path after mesh:")
-    o3d: Any = importlib.import_module("open3d")  # slow, and its type stubs are wrong
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        model = o3d.io.read_triangle_model(str(path))
-        pairs = [(info.mesh_name, info.mesh) for info in model.meshes]
-        if not pairs:  # formats that only the plain reader knows, e.g. PLY
-            pairs = [("mesh", o3d.io.read_triangle_mesh(str(path)))]
+    objects = _read_obj(path) if path.suffix.lower() == ".obj" else _read_other(path)
     objects = [
-        (
-            name or f"object-{index + 1}",
-            np.asarray(mesh.vertices, np.float64),
-            np.asarray(mesh.triangles, np.int32),
-        )
-        for index, (name, mesh) in enumerate(pairs)
-        if len(mesh.triangles)
+        (name, vertices, triangles) for name, vertices, triangles in objects if len(triangles)
     ]
     if not objects:
         raise RigConfigError(
             f"mesh file {path} holds no triangles that could be read; export it as STL, OBJ or PLY"
         )
     return objects
+
+
+def _read_obj(path: Path) -> list[_Object]:
+    """Read an OBJ file ourselves: the general reader merges objects that have no material file."""
+    vertices: list[list[float]] = []
+    faces: dict[str, list[tuple[int, int, int]]] = {}
+    name = "mesh"
+    try:
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            word, *rest = line.split() or [""]
+            if word == "v":
+                vertices.append([float(value) for value in rest[:3]])
+            elif word in ("o", "g", "usemtl"):
+                name = " ".join(rest) or name
+            elif word == "f":
+                corners = [_corner(item, len(vertices)) for item in rest]
+                fan = pairwise(corners[1:])
+                faces.setdefault(name, []).extend((corners[0], b, c) for b, c in fan)
+        points = np.array(vertices, np.float64).reshape(-1, 3)
+        objects: list[_Object] = [
+            (key, points, np.array(f, np.int32).reshape(-1, 3)) for key, f in faces.items()
+        ]
+    except (ValueError, OSError) as error:
+        raise RigConfigError(
+            f"mesh file {path} is no OBJ file ({error}); export it again"
+        ) from None
+    if any(len(f) and not 0 <= f.min() <= f.max() < len(points) for _, _, f in objects):
+        raise RigConfigError(
+            f"mesh file {path} names vertices that it doesn't have; export it again"
+        )
+    return objects
+
+
+def _corner(item: str, count: int) -> int:
+    """Return the vertex of a face's corner such as 7/2/3; negative numbers count from the end."""
+    index = int(item.split("/")[0])
+    return index - 1 if index > 0 else count + index
+
+
+def _read_other(path: Path) -> list[_Object]:
+    o3d: Any = importlib.import_module("open3d")  # slow, and its type stubs are wrong
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        model = o3d.io.read_triangle_model(str(path))
+        pairs = [(info.mesh_name, info.mesh) for info in model.meshes]
+        if not pairs:  # formats that only the plain reader knows, e.g. PLY
+            pairs = [("mesh", o3d.io.read_triangle_mesh(str(path)))]
+    return [
+        (
+            name or f"object-{index + 1}",
+            np.asarray(mesh.vertices, np.float64),
+            np.asarray(mesh.triangles, np.int32),
+        )
+        for index, (name, mesh) in enumerate(pairs)
+    ]
 
 
 def _part(

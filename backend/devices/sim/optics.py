@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 _PIXEL_VARIANCE = 1.0 / 12.0
 """Of a square projector pixel, in [px^2]; its light isn't a point's."""
@@ -27,8 +27,7 @@ def defocus_variance_px2(
     diameter squared as variance per axis.
     """
     diameter = aperture_mm * focal_px * np.abs(1.0 / depth_mm - 1.0 / focus_mm)
-    variance: Float32[np.ndarray, ...] = (diameter**2 / 16.0).astype(np.float32)
-    return variance
+    return np.asarray(diameter**2 / 16.0, np.float32)
 
 
 def projected(
@@ -56,11 +55,19 @@ def blurred(
     """Blur with a Gaussian out to four sigma; 0 returns the picture itself."""
     if sigma_px < 0.05:
         return picture
-    size = 2 * max(1, round(4 * sigma_px)) + 1
-    done: Float32[np.ndarray, "h w"] = cv2.GaussianBlur(
-        picture, (size, size), sigma_px, borderType=border
+    kernel = _kernel(sigma_px)
+    done: Float32[np.ndarray, "h w"] = cv2.sepFilter2D(
+        picture, cv2.CV_32F, kernel, kernel, borderType=border
     )
     return done
+
+
+def _kernel(sigma_px: float) -> Float[np.ndarray, "n 1"]:
+    """Return weights of exactly the variance asked for: a narrow Gaussian sampled at pixels has less."""
+    variance = sigma_px**2
+    if variance < 0.4:
+        return np.array([[variance / 2], [1 - variance], [variance / 2]])
+    return np.asarray(cv2.getGaussianKernel(2 * round(4 * sigma_px) + 1, sigma_px))
 
 
 def veil(rate: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:

@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 _BITS = 8
-_WEIGHTS = 2.0 ** np.arange(_BITS - 1, -1, -1) / (2**_BITS - 1)
-"""Share of the period for each bit, the most significant first."""
+_ORDER = np.array([6, 7, 5, 7, 4, 3, 2, 1, 0])
+"""Which bit is shown in each slot of the period; the longest in two halves, against flicker."""
+_WEIGHTS = 2.0**_ORDER / (2**_BITS - 1) / np.where(_ORDER == 7, 2, 1)
+"""Share of the period of each slot."""
 _STARTS = np.concatenate([[0.0], np.cumsum(_WEIGHTS)[:-1]])
 _TOLERANCE_MS = 1e-3
 """Exposures are set in whole us: a period of 1000/120 ms can't be met better."""
@@ -20,8 +22,7 @@ def mean_light(gamma: float, contrast_ratio: float) -> Float32[np.ndarray, "256"
     """Return the light of each code over whole periods: 1 for white, 1 / contrast for black."""
     linear = (np.arange(256) / 255.0) ** gamma
     black = 1.0 / contrast_ratio
-    light: Float32[np.ndarray, 256] = (black + (1.0 - black) * linear).astype(np.float32)
-    return light
+    return np.asarray(black + (1.0 - black) * linear, np.float32)
 
 
 def whole_periods(exposure_ms: float, period_ms: float | None) -> bool:
@@ -52,18 +53,16 @@ def light_during(
     (k + r) d: about 1 % at 100 ms and 1/120 s, and 80 % below one period.
     """
     level = np.rint(255.0 * mean).astype(np.int64)
-    bits = (level[:, None] >> np.arange(_BITS - 1, -1, -1)) & 1
+    bits = (level[:, None] >> _ORDER) & 1
     periods = exposure_ms / period_ms
     on = _on_time(phase + periods) - _on_time(phase)
     seen = bits @ on
     share = level / (2**_BITS - 1) * periods
     ratio = np.divide(seen, share, out=np.ones(256), where=level > 0)
-    light: Float32[np.ndarray, 256] = (mean * ratio).astype(np.float32)
-    return light
+    return np.asarray(mean * ratio, np.float32)
 
 
-def _on_time(until: float) -> Float[np.ndarray, "8"]:
-    """Return how long each bit's slot has been open since time 0, in periods."""
+def _on_time(until: float) -> Float[np.ndarray, "slot"]:
+    """Return how long each slot has been open since time 0, in periods."""
     whole = np.floor(until)
-    open_: Float[np.ndarray, 8] = whole * _WEIGHTS + np.clip(until - whole - _STARTS, 0, _WEIGHTS)
-    return open_
+    return np.asarray(whole * _WEIGHTS + np.clip(until - whole - _STARTS, 0, _WEIGHTS), np.float64)

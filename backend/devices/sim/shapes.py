@@ -257,5 +257,4 @@ def bump(
     distance: Float[np.ndarray, "..."], width: float | Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "..."]:
     """Return a Gaussian bump of height 1 over a distance."""
-    value: Float[np.ndarray, ...] = np.exp(-0.5 * (distance / width) ** 2)
-    return value
+    return np.asarray(np.exp(-0.5 * (distance / width) ** 2))
