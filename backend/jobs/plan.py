@@ -270,14 +270,12 @@ def next_step(plan: ScanPlan, *, until: str | None, unattended: bool) -> Run | G
     StageUnavailableError
         If `until` is unavailable.
     """
+    if until is not None and (missing := plan.stage(until).missing):
+        raise StageUnavailableError(f"{until} is unavailable: {missing}.")
     for planned in plan.stages:
-        if planned.missing:
-            if planned.name == until:
-                raise StageUnavailableError(f"{until} is unavailable: {planned.missing}.")
-        elif not planned.given:
-            step = _step(planned, unattended)
-            if step:
-                return step
+        available = not (planned.missing or planned.given)
+        if available and (step := _step(planned, unattended)):
+            return step
         if planned.name == until:
             return None
     return None

@@ -105,7 +105,9 @@ def _chosen(
         return finite
     if x is not None and y is not None and len(x) == len(y) == len(points):
         finite = finite[_on_grid(x[finite], y[finite], budget)]
-    return finite[:: math.ceil(len(finite) / budget)]
+    if len(finite) <= budget:
+        return finite
+    return finite[np.arange(budget) * len(finite) // budget]
 
 
 def _on_grid(x: Array, y: Array, budget: int) -> Bool[np.ndarray, "n"]:
