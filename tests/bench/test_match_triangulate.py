@@ -139,16 +139,19 @@ def test_match_and_triangulate(scene: dict[str, Any]) -> None:
     report("triangulate cameras", stereo, copy)
     report("triangulate projector", flat, copy, f"{plain / flat:.1f} times faster than numpy")
     report("triangulate distorting projector", bent, copy)
-    assert matched < 20 * copy
-    assert stereo < 3 * copy
-    assert flat < 4 * copy
+    # Limits against numpy: a busy processor slows both, but hardly the copy.
     assert matched < 8 * plain_match
+    assert flat < plain / 3
+    assert bent < plain
+    assert stereo < plain / 3
 
 
 def test_coordinates_to_cloud(scene: dict[str, Any]) -> None:
     """Maps of two cameras -> filtered cloud with normals and sigma, geometry prepared included."""
     device, sigma = scene["camera"], scene["sigma"]
     angle = pixel_angle(device.K)
+
+    pair = rectify(device, device, scene["pose"])
 
     def chain() -> int:
         pair = rectify(device, device, scene["pose"])
@@ -165,8 +168,11 @@ def test_coordinates_to_cloud(scene: dict[str, Any]) -> None:
             remove(points, kept)
         return int(np.isfinite(normals(points, device)[..., 0]).sum())
 
-    copy, whole = best_ms(Copy(), chain)
+    part = slice(pair.reference.height_px // 2, pair.reference.height_px // 2 + HEIGHT // 8)
+    copy, whole, plain_match = best_ms(
+        Copy(), chain, lambda: numpy_match(scene["left"], scene["right"], pair, part)
+    )
     print()
     report("maps -> cloud, normals, sigma", whole, copy)
     assert chain() > 3_500_000
-    assert whole < 40 * copy
+    assert whole < 2 * 8 * plain_match
