@@ -21,7 +21,7 @@ from backend.numerics.fringe_orders import FringeOrders
 from backend.numerics.phasors import Phasors as FusedFrames
 from backend.numerics.reasons import Reason
 from backend.stages.cloud import REASON_LABELS
-from backend.stages.fusion import AxisPhasors, Phasors
+from backend.stages.fusion import AxisPhasors, Phasors, first_of_each_camera
 
 Unwrapping = Literal["maximum_likelihood", "cascade", "hierarchical", "gray_code"]
 
@@ -205,7 +205,7 @@ def _summarise(
     facts: RigFacts,
 ) -> AbsolutePhase:
     main = decoded["x"] or decoded["y"]
-    first = {s.camera: s for s in reversed(phasors.sets)}
+    first = first_of_each_camera(phasors.sets)
     sigma = {n: _sigma(d) for n, d in main.items()}
     valid = sum(int(np.count_nonzero(d.reasons == 0)) for d in main.values())
     finite = np.concatenate([s[np.isfinite(s)][::7] for s in sigma.values()])

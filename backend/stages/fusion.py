@@ -195,8 +195,16 @@ def _zone_index(
     return index
 
 
+def first_of_each_camera(sets: tuple[AxisPhasors, ...]) -> dict[str, AxisPhasors]:
+    """Return each camera's first set (columns before rows), in the order of the cameras."""
+    first: dict[str, AxisPhasors] = {}
+    for one in sets:
+        first.setdefault(one.camera, one)
+    return first
+
+
 def _summarise(sets: tuple[AxisPhasors, ...], exposures_ms: tuple[float, ...]) -> Phasors:
-    first = {s.camera: s for s in reversed(sets)}
+    first = first_of_each_camera(sets)
     pixels = sum(s.reasons.size for s in first.values())
     saturated = sum(int(np.count_nonzero(s.reasons & Reason.SATURATED)) for s in first.values())
     served = sum(int(np.count_nonzero(s.exposure_index != NO_EXPOSURE)) for s in first.values())
