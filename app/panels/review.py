@@ -58,8 +58,13 @@ class ReviewPanel:
         with self._place:
             self._charts = self._gui.add_folder(None)
         with self._charts:
+            add = {
+                "histogram": self._add_histogram,
+                "curve": self._add_curve,
+                "table": self._add_table,
+            }
             for field in _charted(look.stage):
-                _ADD[str(field.hint["kind"])](self, look, field)
+                add[str(field.hint["kind"])](look, field)
         if old is not None:
             old.remove()
 
@@ -108,13 +113,6 @@ class ReviewPanel:
         self._gui.add_html(
             markup.div("ug-heading", markup.esc(f"{title}, {camera}" if camera else title))
         )
-
-
-_ADD = {
-    "histogram": ReviewPanel._add_histogram,  # noqa: SLF001 - the class's own table
-    "curve": ReviewPanel._add_curve,  # noqa: SLF001
-    "table": ReviewPanel._add_table,  # noqa: SLF001
-}
 
 
 def _charted(stage: StageState) -> list[FieldView]:

@@ -347,7 +347,7 @@ def make_cloud(settings: dict[str, Any]) -> FakeResult:
         f"{len(points)} points",
         (
             FakeField("points_mm", _hint("points", "Point cloud", normals=None, colour="colour", scalars=("sigma_mm", "exposure_index")), arrays={"": points.astype(np.float32)}),
-            FakeField("colour", _hint("hidden", ""), arrays={"": colour}),
+            FakeField("colour", _hint("data", ""), arrays={"": colour}),
             FakeField("sigma_mm", _hint("scalar", "Noise along the ray", unit="mm"), arrays={"": (0.012 / np.sqrt(albedo)).astype(np.float32)}),
             FakeField("exposure_index", _hint("scalar", "Exposure", unit=""), arrays={"": s.exposure_index("left")[valid].astype(np.float32)}),
             _value("n", "Points", len(points)),
@@ -423,7 +423,7 @@ def make_odd(settings: dict[str, Any]) -> FakeResult:
             FakeField("time", _hint("curve", "Time", x=None, x_title="", unit="s", log_y=False), arrays={"": x}),
             FakeField("hologram", _hint("hologram", "A kind that nobody knows")),
             FakeField("vertices", _hint("mesh", "Box", faces="faces"), arrays={"": box}),
-            FakeField("faces", _hint("hidden", ""), arrays={"": faces}),
+            FakeField("faces", _hint("data", ""), arrays={"": faces}),
             FakeField("empty", _hint("table", "Empty table"), value=[]),
             _mask("labels", "Labels", lambda c: (np.indices((48, 64))[1] // 16).astype(np.uint8), labels={"1": EVIL, "2": "two"}),
         ),

@@ -85,9 +85,9 @@ class Scene:
 
     def _shading(self, camera: str) -> Array:
         points = self.points_mm(camera)
-        normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+        normal: Array = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
-        return 0.45 + 0.55 * np.abs(normal[..., 2])
+        return np.asarray(0.45 + 0.55 * np.abs(normal[..., 2]))
 
     def code(self, camera: str) -> Array:
         """Return the projector's column, 0..1, that lights each pixel."""
@@ -98,12 +98,12 @@ class Scene:
     def absolute_phase_rad(self, camera: str) -> Array:
         """Return the unwrapped phase, NaN where there is none."""
         phase = 2.0 * np.pi * PERIODS * self.code(camera)
-        return np.where(self.reasons(camera) == 0, phase, np.nan).astype(np.float32)
+        return np.asarray(np.where(self.reasons(camera) == 0, phase, np.nan), dtype=np.float32)
 
     def wrapped_phase_rad(self, camera: str) -> Array:
         """Return the wrapped phase."""
         phase = 2.0 * np.pi * PERIODS * self.code(camera)
-        return np.angle(np.exp(1j * phase)).astype(np.float32)
+        return np.asarray(np.angle(np.exp(1j * phase)), dtype=np.float32)
 
     def modulation_gray(self, camera: str) -> Array:
         """Return the amplitude of the fringes."""
@@ -116,7 +116,7 @@ class Scene:
         dark = (albedo < 0.1) & (rng.random(albedo.shape) < 0.04)
         bright = (albedo > 0.8) & (rng.random(albedo.shape) < 0.002)
         edge = np.hypot(*np.gradient(self.points_mm(camera)[..., 2])) > 6.0
-        return (dark * 1 + bright * 2 + edge * 4).astype(np.uint8)
+        return np.asarray(dark * 1 + bright * 2 + edge * 4, dtype=np.uint8)
 
     def exposure_index(self, camera: str) -> Array:
         """Return which exposure serves each pixel, 1 is the shortest."""
