@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -28,10 +28,19 @@ def field_views(result_type: type, document: Mapping[str, Any]) -> tuple[FieldVi
     `data`: there to be fetched, not to be shown.
     """
     return tuple(
-        _view(shown, document[shown.name])
+        _view(_with_texts(shown, document), document[shown.name])
         for shown in _shown(result_type)
         if shown.name in document
     )
+
+
+def _with_texts(shown: _Shown, document: Mapping[str, Any]) -> _Shown:
+    """Put the texts of a mask's labels into its hint where they depend on the result."""
+    texts = document.get(str(shown.hint.get("names")))
+    if not isinstance(texts, list):
+        return shown
+    labels = {number: str(text) for number, text in enumerate(texts, start=1)}
+    return replace(shown, hint={**shown.hint, "labels": labels})
 
 
 def point_count(result_type: type, document: Mapping[str, Any]) -> int | None:
