@@ -7,11 +7,12 @@ import os
 import secrets
 import signal
 import sys
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from fastapi import FastAPI
 
@@ -20,14 +21,17 @@ from backend.api.context import Context
 from backend.api.server import TokensHidden, public_socket, server_for
 from backend.api.sessions import Sessions, Tokens
 from backend.api.station import Station
+from backend.contract.rigs import RigOffer
 from backend.devices.loading import open_rig
+from backend.devices.protocols import Rig
 from backend.domain.errors import StartupError
 from backend.jobs.execution import Workshop
-from backend.jobs.rigs import RigPool
+from backend.jobs.rigs import OpenRig, RigPool
 from backend.jobs.runner import LocalRunner, Runner
 from backend.methods import registry
 from backend.numerics.warm_up import warm_up
 from backend.services.events import EventHub
+from backend.services.rig_offers import offer_rigs
 from backend.services.services import Services
 from backend.settings import Settings, load_settings
 from backend.storage.artifacts import LocalArtifactStore
@@ -73,7 +77,7 @@ def build_services(
         database.close()
         raise
     events = EventHub()
-    rigs = RigPool(open_rig, events.publish)
+    rigs = RigPool(rig_opener(settings), events.publish)
     shop = Workshop(database, store, rigs, registry, events.publish)
     return Services(
         database=database,
@@ -83,7 +87,27 @@ def build_services(
         registry=registry(),
         events=events,
         version=version("unglare"),
+        offers=lambda: rig_offers(settings),
     )
+
+
+def rig_opener(settings: Settings) -> OpenRig:
+    """Return what opens rigs: this station's own gets the options of the settings, where a scan names no others."""
+
+    def opened(name: str, options: Mapping[str, Any]) -> Rig:
+        own = settings.rig_options if name == settings.rig else {}
+        return open_rig(name, {**own, **options})
+
+    return opened
+
+
+def rig_offers(settings: Settings) -> tuple[RigOffer, ...]:
+    """Offer this station's own rig first, also one that has no name but `package.module:factory`."""
+    known = offer_rigs()
+    own = [offer for offer in known if offer.name == settings.rig]
+    others = [offer for offer in known if offer.name != settings.rig]
+    unnamed = RigOffer(name=settings.rig, title=settings.rig, doc="", options_schema={})
+    return (*(own or [unnamed]), *others)
 
 
 def build_application(
@@ -126,7 +150,12 @@ def build_application(
     )
 
 
-def serve(settings: Settings, *, announce: Callable[[str], None] = print) -> None:
+def serve(
+    settings: Settings,
+    *,
+    announce: Callable[[str], None] = print,
+    prepare: Callable[[Services], None] | None = None,
+) -> None:
     """Serve the application until it is told to stop (Ctrl+C or SIGTERM).
 
     Parameters
@@ -135,6 +164,8 @@ def serve(settings: Settings, *, announce: Callable[[str], None] = print) -> Non
         Everything that can be chosen.
     announce
         Is told the addresses to open, token included, once it listens.
+    prepare
+        Called after that, in a thread of its own: nobody waits for what it does.
 
     Raises
     ------
@@ -152,13 +183,17 @@ def serve(settings: Settings, *, announce: Callable[[str], None] = print) -> Non
         contextlib.suppress(KeyboardInterrupt),
     ):
         port = listening.getsockname()[1]
-        services = build_services(settings)
-        interrupted = services.recover()
-        if interrupted:
-            _log.warning("%d runs were interrupted when the server stopped.", interrupted)
-        app = build_application(settings, services, port=port, token=token)
-        announce(_welcome(settings, port, token))
-        server_for(app, trusted_proxies=settings.trusted_proxies).run(sockets=[listening])
+        with contextlib.closing(build_services(settings)) as services:
+            interrupted = services.recover()
+            if interrupted:
+                _log.warning("%d runs were interrupted when the server stopped.", interrupted)
+            app = build_application(settings, services, port=port, token=token)
+            announce(_welcome(settings, port, token))
+            if prepare is not None:
+                threading.Thread(
+                    target=prepare, args=(services,), name="prepare", daemon=True
+                ).start()
+            server_for(app, trusted_proxies=settings.trusted_proxies).run(sockets=[listening])
 
 
 def configure_logging(level: str) -> None:

@@ -49,12 +49,13 @@ class Settings(BaseSettings):
     session_hours: float = Field(12.0, gt=0, le=24 * 365)
     """After that a login ends."""
     trusted_proxies: str = ""
-    """Addresses of a TLS proxy in front, separated by commas: its X-Forwarded-* headers are believed."""
+    """Addresses of a TLS proxy in front, separated by commas: its X-Forwarded-* headers are believed. It has to
+    pass on Host and Origin as they came."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     rig: str = "simulated"
-    """Rig that new scans are made with, as its name or `package.module:factory`."""
+    """This station's own rig, offered first: its name or `package.module:factory`."""
     rig_options: dict[str, Any] = {}
-    """Options of that rig, as JSON."""
+    """Its options where a scan names no others, as JSON."""
     upload_limit_mb: int = Field(8192, gt=0)
     """Largest capture that can be uploaded, packed and unpacked [MiB]."""
     threads: int = Field(16, ge=2, le=256)

@@ -9,6 +9,7 @@ import enum
 import hashlib
 import hmac
 import ipaddress
+import logging
 import math
 import secrets
 import time
@@ -16,6 +17,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from backend.api.errors import NotLoggedInError, TooManyAttemptsError
+
+_log = logging.getLogger(__name__)
 
 LONGEST_NAME = 60
 STATION_PREFIX = "station."
@@ -179,6 +182,7 @@ class Sessions:
         session = Session(tidy_name(name) or role.value, role, self._clock() + self._lifetime_s)
         self._by_cookie[_digest(cookie)] = session
         self._by_station_token[_digest(session.station_token)] = session
+        _log.info("%s logged in as %s from %s.", session.user, role.value, address)
         return cookie, session
 
     def of_cookie(self, cookie: str) -> Session | None:
@@ -222,6 +226,7 @@ class Sessions:
         role = self._tokens.role_of(token)
         if role is None:
             self._attempts.failed(address, self._clock())
+            _log.warning("A wrong token came from %s.", address)
             raise NotLoggedInError(
                 "The token is wrong; the right one stands in the terminal where the server was started."
             )

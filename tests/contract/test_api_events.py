@@ -9,6 +9,8 @@ import httpx
 import pytest
 
 from backend.contract.events import RigChanged, ScanChanged
+from backend.domain.states import JobStatus
+from backend.jobs.runner import LocalRunner
 from backend.services.events import EventHub
 from tests.contract.api_server import (
     COOKIE,
@@ -19,7 +21,7 @@ from tests.contract.api_server import (
     serving,
     toy_house,
 )
-from tests.scans.toy_house import House
+from tests.scans.toy_house import House, data_folder
 
 MINE, OTHER = ScanChanged(scan="mine", revision=2), ScanChanged(scan="other", revision=5)
 
@@ -107,6 +109,21 @@ def test_open_streams_dont_keep_the_server_alive(
 
         assert [list(lines) for lines in streams] == [[], []]
     assert "timeout graceful shutdown exceeded" not in caplog.text
+
+
+def test_a_run_that_the_end_of_the_server_meets_can_be_continued(tmp_path: Path) -> None:
+    with toy_house(tmp_path, LocalRunner) as house:
+        house.rigs.faults.hold = threading.Event()  # the camera delivers nothing
+        with serving(api(house, tmp_path)) as address, program(address) as client:
+            with listening(client) as lines:
+                scan = house.create().id
+                assert client.post(f"/api/scans/{scan}/runs", json={}).status_code == 202
+                assert next(line for line in lines if '"stage":"toy_look"' in line)
+
+    with contextlib.closing(data_folder(tmp_path)[0]) as database, database.reading() as rows:
+        job = rows.jobs.last_of(scan)
+    assert job is not None
+    assert job.status is JobStatus.INTERRUPTED
 
 
 def test_without_a_token_there_are_no_events(address: str) -> None:

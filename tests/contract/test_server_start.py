@@ -13,10 +13,15 @@ from pathlib import Path
 import httpx
 import pytest
 
+from backend.contract.requests import CreateScan
 from backend.domain.errors import StartupError
+from backend.domain.states import JobStatus
 from backend.jobs.runner import InlineRunner
-from backend.main import build_application, build_services
+from backend.main import build_application, build_services, rig_offers, rig_opener
 from backend.settings import Settings, load_settings
+from backend.storage.database import utc_now
+from backend.storage.rows import JobRow
+from tests.scans.toy import Faults, ToyRig
 
 HEAVY = {"open3d", "viser", "pytest", "matplotlib", "plotly"}
 
@@ -77,6 +82,22 @@ def test_a_second_server_on_the_same_data_is_kept_out(tmp_path: Path) -> None:
     assert process.returncode == 0
 
 
+def test_what_a_killed_server_left_running_is_interrupted(tmp_path: Path) -> None:
+    settings = settings_in(tmp_path)
+    with contextlib.closing(build_services(settings, make_runner=InlineRunner)) as services:
+        scan = services.create_scan(CreateScan(method="hdr-fringe"), "Ada").id
+        job = JobRow("a job", scan, JobStatus.RUNNING, "Ada", utc_now())
+        with services.context.database.transaction() as repositories:
+            repositories.jobs.add(job)
+
+    with server(tmp_path) as (_, address, token):
+        headers = {"Authorization": f"Bearer {token}"}
+        state = httpx.get(f"{address}/api/scans/{scan}", headers=headers, trust_env=False).json()
+
+    assert state["job"]["status"] == "interrupted"
+    assert "run again to go on" in state["job"]["error"]
+
+
 def test_a_port_in_use_is_a_sentence_and_a_status(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -116,6 +137,29 @@ def test_a_folder_that_cant_be_made_is_named(tmp_path: Path) -> None:
 def test_a_database_that_cant_be_opened_is_named(tmp_path: Path) -> None:
     with pytest.raises(StartupError, match="database"):
         build_services(settings_in(tmp_path, database_url="nonsense://"))
+
+
+def test_the_stations_own_rig_is_offered_first_and_opened_with_its_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[tuple[str, dict[str, object]]] = []
+
+    def note(name: str, options: dict[str, object]) -> ToyRig:
+        opened.append((name, options))
+        return ToyRig(name, options, Faults())
+
+    monkeypatch.setattr("backend.main.open_rig", note)
+    settings = settings_in(tmp_path, rig="lab.rigs:shiny", rig_options={"port": 7, "fast": True})
+
+    opener = rig_opener(settings)
+    opener("lab.rigs:shiny", {"fast": False})
+    opener("simulated", {"seed": 1})
+
+    assert [offer.name for offer in rig_offers(settings)][:2] == ["lab.rigs:shiny", "simulated"]
+    assert opened == [
+        ("lab.rigs:shiny", {"port": 7, "fast": False}),
+        ("simulated", {"seed": 1}),
+    ]
 
 
 def test_without_any_token_there_is_no_application(tmp_path: Path) -> None:
