@@ -93,6 +93,7 @@ def compute_inline(shop: Workshop) -> Compute:
 
 def store_rig(repositories: Repositories, store: ArtifactStore, scan: str, rig: RigGiven) -> None:
     """Hand a rig's facts, and its calibration if it has one, to a scan; once for all."""
+    repositories.scans.lock(scan)
     known = repositories.given.of(scan)
     for kind, result in ((RigFacts, rig.facts), (RigCalibration, rig.calibration)):
         if result is not None and kind.__name__ not in known:

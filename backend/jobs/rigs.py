@@ -91,30 +91,38 @@ class RigPool:
         self._slots: dict[str, _Slot] = {}
         self._given: dict[tuple[str, str], RigGiven] = {}
 
-    def given(self, name: str, options: Mapping[str, Any]) -> RigGiven:
-        """Return facts and calibration of a rig; opens it unless they are known already.
+    def ask(self, name: str, options: Mapping[str, Any]) -> "Future[RigGiven]":
+        """Ask a rig for facts and calibration; it is opened for that in the background, which may take seconds.
 
         Raises
         ------
         RigBusyError
-            If they aren't known and the rig captures with other options.
-        NotFoundError, InvalidSettingError, DeviceError
-            If there is no such rig, an option can't be used, or a device doesn't answer.
+            At once, if they aren't known and the rig captures with other options.
+        NotFoundError, InvalidSettingError
+            At once, if there is no such rig or an option can't be used.
         """
         key = (name, _canonical(options))
-        if key not in self._given:
-            self._given[key] = self.use(
-                name, options, lambda rig: RigGiven(rig.facts(), rig.calibration())
-            )
-        return self._given[key]
+        if key in self._given:
+            known: Future[RigGiven] = Future()
+            known.set_result(self._given[key])
+            return known
+        slot = self._slot(name)
+        slot.refuse_other(options)
+        made = None if slot.holds(options) else self._open_rig(name, options)
+        return slot.opened(options, lambda rig: self._given[key], made=made)
+
+    def given(self, name: str, options: Mapping[str, Any]) -> RigGiven:
+        """Wait for the facts and the calibration of a rig; raises what `ask` does, DeviceError if a device doesn't answer."""
+        return self.ask(name, options).result()
 
     def use(self, name: str, options: Mapping[str, Any], work: Callable[[Rig], T]) -> T:
         """Ask a rig something that takes no pictures (its truth, its devices' names), on its own thread.
 
-        Waits for a picture that is being taken, not for a capture: while one goes on, only a rig with the same
-        options can be asked.
+        Waits for what the rig is doing; `RigBusyError` at once if it captures with other options.
         """
-        return self._slot(name).opened(options, work).result()
+        slot = self._slot(name)
+        slot.refuse_other(options)
+        return slot.opened(options, work).result()
 
     @contextmanager
     def lease(self, name: str, options: Mapping[str, Any], owner: Owner) -> Iterator[Lease]:
@@ -170,15 +178,25 @@ class RigPool:
     def _slot(self, name: str) -> "_Slot":
         with self._lock:
             if name not in self._slots:
-                self._slots[name] = _Slot(name, self._open_rig, self._publish)
+                self._slots[name] = _Slot(name, self._open_rig, self._publish, self._remember)
             return self._slots[name]
+
+    def _remember(self, name: str, options: str, rig: Rig) -> None:
+        self._given[name, options] = RigGiven(rig.facts(), rig.calibration())
 
 
 class _Slot:
     """The place of one rig: its thread, its owner, its newest pictures."""
 
-    def __init__(self, name: str, open_rig: OpenRig, publish: Callable[[Event], None]) -> None:
+    def __init__(
+        self,
+        name: str,
+        open_rig: OpenRig,
+        publish: Callable[[Event], None],
+        opened: Callable[[str, str, Rig], None],
+    ) -> None:
         self.name = name
+        self._tell_opened = opened
         self.live: dict[str, LivePicture] = {}
         self._open_rig = open_rig
         self._publish = publish
@@ -186,7 +204,7 @@ class _Slot:
         self._lock = threading.Lock()
         self._owner: Owner | None = None
         self._rig: Rig | None = None
-        self._options = ""
+        self._options: str | None = None
         self._picture: Future[None] | None = None
 
     @property
@@ -217,8 +235,21 @@ class _Slot:
         """Run something with the open rig, on its thread."""
         return self._thread.submit(lambda: work(self._opened_rig()))
 
+    def holds(self, options: Mapping[str, Any]) -> bool:
+        """Tell whether the open rig has these options."""
+        return self._options == _canonical(options)
+
+    def refuse_other(self, options: Mapping[str, Any]) -> None:
+        if not self.holds(options):
+            self.refuse_busy()
+
     def opened(
-        self, options: Mapping[str, Any], work: Callable[[Rig], T], *, leased: bool = False
+        self,
+        options: Mapping[str, Any],
+        work: Callable[[Rig], T],
+        *,
+        leased: bool = False,
+        made: Rig | None = None,
     ) -> Future[T]:
         """Open the rig if it isn't, then run something with it, on its thread.
 
@@ -227,9 +258,9 @@ class _Slot:
         """
 
         def open_and_work() -> T:
-            if not leased and _canonical(options) != self._options:
-                self.refuse_busy()
-            self._open(options)
+            if not leased:
+                self.refuse_other(options)
+            self._open(options, made)
             return work(self._opened_rig())
 
         return self._thread.submit(open_and_work)
@@ -255,21 +286,25 @@ class _Slot:
             raise RigFailedError(f"Rig {self.name!r} was closed in the meantime: run again.")
         return self._rig
 
-    def _open(self, options: Mapping[str, Any]) -> None:
-        wanted = _canonical(options)
-        if self._rig is not None and wanted == self._options and _is_healthy(self._rig):
+    def _open(self, options: Mapping[str, Any], made: Rig | None) -> None:
+        if self._rig is not None and self.holds(options) and _is_healthy(self._rig):
             return
         self._close()
-        rig = self._open_rig(self.name, options)
+        rig = made or self._open_rig(self.name, options)
         rig.open()
-        self._rig, self._options = rig, wanted
+        try:
+            self._tell_opened(self.name, _canonical(options), rig)
+        except BaseException:
+            rig.close()
+            raise
+        self._rig, self._options = rig, _canonical(options)
         self._publish(RigChanged(rig=self.name))
 
     def _close(self) -> None:
         if self._rig is None:
             return
         self._rig.close()
-        self._rig, self._options = None, ""
+        self._rig, self._options = None, None
         self.live.clear()
         self._publish(RigChanged(rig=self.name))
 

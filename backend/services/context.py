@@ -27,5 +27,7 @@ class Context:
     events: EventHub
     version: str
     clock: Callable[[], datetime] = utc_now
+    rig_patience_s: float = 0.05
+    """How long a new scan waits for its rig's facts; later they come by themselves."""
     offers: Callable[[], tuple[RigOffer, ...]] = offer_rigs
     previews: PreviewCache = field(default_factory=PreviewCache)

@@ -1,8 +1,12 @@
 """Make scans, list them, look at one."""
 
+import logging
+from concurrent.futures import Future
+
+from backend.contract.events import ScanChanged
 from backend.contract.requests import CreateScan
 from backend.contract.scans import AuditEntry, ScanState, ScanSummary
-from backend.domain.errors import RigBusyError
+from backend.domain.errors import RigBusyError, UnglareError
 from backend.domain.ids import new_id
 from backend.jobs.edits import check_recipe, preset_values
 from backend.jobs.execution import store_rig
@@ -12,12 +16,14 @@ from backend.services.states import scan_state, scan_summary
 from backend.services.telling import announce
 from backend.storage.rows import ScanRow
 
+log = logging.getLogger(__name__)
+
 
 def create_scan(context: Context, request: CreateScan, who: str) -> ScanState:
     """Make a scan with the rig's facts and calibration; nothing runs yet.
 
-    The rig is opened for it unless its facts are known. Where it captures with other options just now, it is
-    asked at the scan's first run instead, so that nobody waits.
+    The rig is opened for it unless its facts are known; opening may take seconds, so the answer doesn't wait and
+    the facts follow. Where it captures with other options just now, it is asked at the scan's first run instead.
 
     Raises
     ------
@@ -26,12 +32,12 @@ def create_scan(context: Context, request: CreateScan, who: str) -> ScanState:
     InvalidSettingError
         If the preset, a setting of the recipe or an option of the rig can't be used.
     DeviceError
-        If a device of the rig doesn't answer.
+        If a device of the rig refuses at once.
     """
     method = context.registry.get(request.method)
     preset_values(method, request.preset)
     recipe = check_recipe(method, request.preset, request.settings)
-    rig = _ask_rig(context, request)
+    asked, rig = _ask_rig(context, request)
     row = ScanRow(
         id=new_id(),
         name=request.name,
@@ -58,6 +64,8 @@ def create_scan(context: Context, request: CreateScan, who: str) -> ScanState:
         }
         repositories.audit.add(row.id, who, "created", None, sentence, details)
         state = scan_state(context, repositories, row.id)
+    if asked is not None and rig is None:
+        asked.add_done_callback(lambda answer: _store_late(context, row.id, answer))
     return announce(context, state)
 
 
@@ -88,8 +96,27 @@ def audit_trail(context: Context, scan: str) -> tuple[AuditEntry, ...]:
     )
 
 
-def _ask_rig(context: Context, request: CreateScan) -> RigGiven | None:
+def _ask_rig(
+    context: Context, request: CreateScan
+) -> tuple[Future[RigGiven] | None, RigGiven | None]:
+    """Return the question and, if it came at once, the answer."""
     try:
-        return context.rigs.given(request.rig, request.rig_options)
+        asked = context.rigs.ask(request.rig, request.rig_options)
+        return asked, asked.result(timeout=context.rig_patience_s)
     except RigBusyError:
-        return None
+        return None, None
+    except TimeoutError:
+        return asked, None
+
+
+def _store_late(context: Context, scan: str, answer: Future[RigGiven]) -> None:
+    """Hand a rig's facts to a scan that was made before they were known."""
+    try:
+        with context.database.transaction() as repositories:
+            store_rig(repositories, context.store, scan, answer.result())
+            revision = repositories.scans.get(scan).revision
+    except UnglareError as error:
+        # The first run asks again, and tells the operator.
+        log.warning("Scan %s doesn't know its rig yet: %s", scan, error)
+        return
+    context.events.publish(ScanChanged(scan=scan, revision=revision))

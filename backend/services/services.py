@@ -37,6 +37,7 @@ from backend.services import (
 )
 from backend.services.context import Context
 from backend.services.events import EventHub
+from backend.services.export_folder import refuse_foreign
 from backend.services.points import pack_points
 from backend.services.previews import Format, Kind, draw, value_at
 from backend.services.rig_offers import offer_rigs
@@ -59,6 +60,8 @@ class Services:
         The application's version.
     clock
         Now, in UTC.
+    rig_patience_s
+        How long the answer to a new scan waits for its rig's facts [s]; later they come by themselves.
     offers
         Which rigs there are to choose from.
     """
@@ -74,6 +77,7 @@ class Services:
         events: EventHub,
         version: str,
         clock: Callable[[], datetime] = utc_now,
+        rig_patience_s: float = 0.05,
         offers: Callable[[], tuple[RigOffer, ...]] = offer_rigs,
     ) -> None:
         self.context = Context(
@@ -85,8 +89,10 @@ class Services:
             events=events,
             version=version,
             clock=clock,
+            rig_patience_s=rig_patience_s,
             offers=offers,
         )
+        self._closed = False
 
     @property
     def events(self) -> EventHub:
@@ -98,7 +104,10 @@ class Services:
         return recover(self.context.database)
 
     def close(self) -> None:
-        """Interrupt what runs, so that it can be continued, and give rigs and database back."""
+        """Interrupt what runs, so that it can be continued, and give rigs and database back; once is enough."""
+        if self._closed:
+            return
+        self._closed = True
         self.context.runner.close()
         self.context.rigs.close()
         self.context.database.close()
@@ -158,6 +167,10 @@ class Services:
         return exporting.export_scan(
             self.context, scan, Path(folder), frames=frames, who=who, progress=progress
         )
+
+    def refuse_export(self, folder: str) -> None:
+        """Raise `ConflictError` if an export to that folder would be refused: before long work is done for it."""
+        refuse_foreign(Path(folder).expanduser().absolute())
 
     def cloud_ply(self, scan: str) -> Iterator[bytes | memoryview]:
         """Return the last cloud of a scan as a PLY file, in pieces; ConflictError if it has none."""

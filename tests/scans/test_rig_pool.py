@@ -74,6 +74,24 @@ def test_other_options_close_the_rig_first_but_never_a_lent_one(place: Place) ->
     assert place.pool.given("toy", {"seed": 3})
 
 
+def test_a_busy_rig_refuses_other_options_at_once(place: Place) -> None:
+    """Not when its thread has time again."""
+    blocked = threading.Event()
+    with place.pool.lease("toy", {}, ADA) as lease:
+        work = threading.Thread(target=lease.call, args=(lambda rig: blocked.wait(20),))
+        work.start()
+        for ask in (place.pool.given, place.pool.ask):
+            with pytest.raises(RigBusyError):
+                ask("toy", {"seed": 9})
+        blocked.set()
+        work.join()
+
+
+def test_bad_options_are_refused_at_once(place: Place) -> None:
+    with pytest.raises(RigFailedError, match="doesn't answer"):
+        place.pool.ask("toy", {"broken": True})
+
+
 def test_options_in_another_order_are_the_same(place: Place) -> None:
     place.pool.given("toy", {"seed": 1, "noise": True})
     place.pool.use("toy", {"noise": True, "seed": 1}, lambda rig: None)

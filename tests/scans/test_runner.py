@@ -5,11 +5,13 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
-from backend.contract.events import Event, JobProgress, ScanChanged
+from backend.contract.events import Event, JobProgress, RigChanged, ScanChanged
 from backend.contract.requests import StartRun
+from backend.devices.errors import DeviceNotFound
 from backend.domain.errors import ConflictError, RigBusyError
 from backend.domain.states import JobStatus
 from backend.jobs.control import JobControl
@@ -207,9 +209,48 @@ def test_a_busy_rig_doesnt_keep_a_scan_from_being_made(local: House) -> None:
     assert stage(later, "toy_look").message == "Not run yet: the rig is asked for its facts first."
     assert set(statuses(later).values()) == {"pending"}
     gate.open.set()
-    local.services.wait(busy, WAIT_S)
+    assert statuses(local.services.wait(busy, WAIT_S))["look"] == "done"
     assert waiting(local.run(later.id)) is not None
     assert [rig.closed for rig in local.rigs.opened] == [1, 0], "one rig of a name is open"
+
+
+def test_a_slow_rig_doesnt_keep_a_scan_from_being_made(house: House) -> None:
+    """It is opened in the background, and what it says follows."""
+    ready, known = threading.Event(), threading.Event()
+    house.rigs.faults.before_open = lambda: assert_true(ready.wait(WAIT_S))
+    house.services.context = replace(house.services.context, rig_patience_s=0.0)
+    state = house.create()
+    assert stage(state, "toy_look").key is None
+    house.watchers.append(lambda event: known.set() if isinstance(event, RigChanged) else None)
+    ready.set()
+    assert known.wait(WAIT_S)
+    house.shop.rigs.use(
+        "toy", {}, lambda rig: None
+    )  # after what the rig's thread does with the answer
+    assert stage(house.services.scan(state.id), "toy_look").key is not None
+
+
+def test_a_rig_that_doesnt_answer_in_time_is_told_by_the_first_run(house: House) -> None:
+    ready = threading.Event()
+
+    def fail() -> None:
+        ready.wait(WAIT_S)
+        raise DeviceNotFound("left", "nothing answers at 10.0.0.2; check its cable")
+
+    house.rigs.faults.before_open = fail
+    house.services.context = replace(house.services.context, rig_patience_s=0.0)
+    scan = house.create().id
+    ready.set()
+    state = house.run(scan)
+    assert state.job is not None
+    assert state.job.error == "left: nothing answers at 10.0.0.2; check its cable"
+    assert set(statuses(state).values()) == {"pending"}
+    house.rigs.faults.before_open = lambda: None
+    assert waiting(house.run(scan)) is not None
+
+
+def assert_true(value: bool) -> None:
+    assert value
 
 
 def test_nothing_to_cancel(local: House) -> None:

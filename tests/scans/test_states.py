@@ -32,6 +32,12 @@ def field(state: ScanState, stage_name: str, name: str) -> FieldView:
     return next(f for f in stage(state, stage_name).fields if f.name == name)
 
 
+def size_of(picture: bytes) -> tuple[int, ...]:
+    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return tuple(decoded.shape)
+
+
 def test_the_head_of_a_state(house: House, state: ScanState) -> None:
     assert (state.name, state.note, state.method, state.rig, state.who) == (
         "part", "for the test", "toy", "toy", "ada",
@@ -98,7 +104,7 @@ def test_a_pixel_a_picture_and_a_cloud_can_be_asked_for(house: House, state: Sca
     value = house.services.artifact_at(phase.hash, 3, 2)
     assert value == pytest.approx(float(house.services.artifact(phase.hash)[2, 3]))
     picture = house.services.artifact_preview(phase.hash, colormap="twilight")
-    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape == (16, 24, 3)
+    assert size_of(picture) == (16, 24, 3)
     assert house.services.artifact_preview(phase.hash, colormap="twilight") is picture, "remembered"
     run = stage(state, "toy_cloud").stage_run
     assert run
@@ -173,7 +179,7 @@ def test_what_was_never_asked_isnt_known(house: House) -> None:
 def test_the_live_picture_is_the_newest_frame(house: House, state: ScanState) -> None:
     picture = house.services.live_frame("toy", "left")
     assert picture is not None
-    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape == (16, 24, 3)
+    assert size_of(picture) == (16, 24, 3)
     assert house.services.live_frame("toy", "top") is None
     assert house.services.live_frame("nowhere", "left") is None
 

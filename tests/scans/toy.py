@@ -260,12 +260,11 @@ def toy_phase(
 
 
 def _phase(fringes: Fringes, camera: str) -> np.ndarray:
-    total = sum(
-        f.gray.astype(float) * np.exp(-1j * f.pattern.shift_rad)
-        for f in fringes.frames
-        if f.camera == camera
-    )
-    return np.angle(total)
+    frames = [f for f in fringes.frames if f.camera == camera]
+    shifts = [f.pattern.shift_rad for f in frames if isinstance(f.pattern, Sine)]
+    gray = np.stack([f.gray.astype(float) for f in frames])
+    phase: np.ndarray = np.angle(np.tensordot(np.exp(-1j * np.array(shifts)), gray, axes=1))
+    return phase
 
 
 def misbehave(behave: str, progress: Progress) -> None:
@@ -355,6 +354,7 @@ class Faults:
     """Number of the exposure (1, 2 ...) -> errors that its `get_frame` raises, one per attempt."""
     before_shot: Callable[[int], None] = lambda shot: None
     """Called by the projector with the number of the shot (1, 2 ...)."""
+    before_open: Callable[[], None] = lambda: None
     hold: threading.Event | None = None
     """While it isn't set, `get_frame` waits."""
 
@@ -484,6 +484,7 @@ class ToyRig(Closing):
         self._random = np.random.default_rng(options.get("seed", 0))
 
     def open(self) -> None:
+        self.faults.before_open()
         self.opened += 1
         for device in (*self.cameras.values(), self.projector):
             device.open()

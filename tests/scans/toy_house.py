@@ -59,6 +59,7 @@ class House:
             registry=toy_registry(),
             events=hub,
             version="test",
+            rig_patience_s=10.0,
         )
 
     def create(self, *, who: str = "ada", **options: Any) -> ScanState:
