@@ -9,7 +9,7 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,16 @@ from backend.domain.ids import new_id
 Array = np.ndarray[tuple[int, ...], np.dtype[Any]]
 
 SCAN_FILE = "scan.json"
+
+
+class FolderKind(NamedTuple):
+    """How a folder of ours is known again: by a JSON file that says its format and lists its files."""
+
+    index_file: str
+    format: str
+
+
+SCAN = FolderKind(SCAN_FILE, SCAN_FORMAT)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -68,20 +78,20 @@ def safe_name(text: str) -> str:
 
 
 @contextlib.contextmanager
-def whole_folder(folder: Path) -> Iterator[ExportFolder]:
+def whole_folder(folder: Path, kind: FolderKind = SCAN) -> Iterator[ExportFolder]:
     """Make a folder: it takes its place when all is written; on any error nothing is left behind.
 
     Raises
     ------
     ConflictError
-        If something else than an export of ours is there already, or the place can't be written.
+        If something else than an export of that kind is there already, or the place can't be written.
     StorageFullError
         If there is no room.
     """
     place = folder.expanduser().absolute()
     partial = place.parent / f".{place.name}.{new_id()}.partial"
     with _readable_errors(place):
-        refuse_foreign(place)
+        refuse_foreign(place, kind)
         partial.mkdir(parents=True)
         try:
             yield ExportFolder(partial)
@@ -90,7 +100,7 @@ def whole_folder(folder: Path) -> Iterator[ExportFolder]:
             shutil.rmtree(partial, ignore_errors=True)
 
 
-def refuse_foreign(place: Path) -> None:
+def refuse_foreign(place: Path, kind: FolderKind = SCAN) -> None:
     """Refuse a place where there is anything that isn't an older export of ours, whole or in part."""
     if not place.exists():
         return
@@ -99,10 +109,10 @@ def refuse_foreign(place: Path) -> None:
     found = {str(p.relative_to(place)) for p in place.rglob("*") if not p.is_dir()}
     if not found:
         return
-    own = _files_of_export(place / SCAN_FILE)
+    own = _files_of_export(place, kind)
     if own is None:
         raise ConflictError(
-            f"{place} isn't empty and isn't an export of a scan: name a new folder."
+            f"{place} isn't empty and isn't an older export of the same kind: name a new folder."
         )
     if foreign := sorted(found - own):
         raise ConflictError(
@@ -110,10 +120,10 @@ def refuse_foreign(place: Path) -> None:
         )
 
 
-def _files_of_export(file: Path) -> set[str] | None:
+def _files_of_export(place: Path, kind: FolderKind) -> set[str] | None:
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-        return {SCAN_FILE, *document["files"]} if document["format"] == SCAN_FORMAT else None
+        document = json.loads((place / kind.index_file).read_text(encoding="utf-8"))
+        return {kind.index_file, *document["files"]} if document["format"] == kind.format else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

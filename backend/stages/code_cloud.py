@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt16
 
 from backend.domain.errors import StageFailedError
 from backend.domain.params import Params, setting
-from backend.domain.rig import PinholeModel, Pose, RigCalibration
+from backend.domain.rig import RigCalibration
 from backend.domain.shots import Progress
 from backend.domain.stage import stage
 from backend.domain.states import Review
-from backend.numerics.camera_model import Pinhole, RigidTransform, compose, inverse, project
+from backend.numerics.camera_model import Pinhole, RigidTransform, project
 from backend.numerics.code_points import triangulate_code
 from backend.numerics.gray_code import distinct_projector_pixels
 from backend.numerics.normals import normals
@@ -25,6 +25,7 @@ from backend.stages.cloud import (
     precise_enough,
 )
 from backend.stages.edges import Codes
+from backend.stages.rig_geometry import pinhole, projector_from_reference, require_camera
 
 _EXPOSURE_UNKNOWN = 255
 _ROUNDING_PX = float(1 / np.sqrt(12.0))
@@ -83,27 +84,14 @@ class _Pair:
     @classmethod
     def of(cls, calibration: RigCalibration) -> "_Pair":
         """Take them out of the rig's calibration."""
-        if calibration.projector is None or calibration.projector_from_world is None:
+        projector_from_camera = projector_from_reference(calibration)
+        if calibration.projector is None or projector_from_camera is None:
             raise StageFailedError(
                 "The projector isn't calibrated: points from one camera need its calibration."
             )
         name = calibration.reference
-        camera_from_world = _transform(calibration.camera_from_world[name])
-        projector_from_world = _transform(calibration.projector_from_world)
-        return cls(
-            name,
-            _pinhole(calibration.cameras[name]),
-            _pinhole(calibration.projector),
-            compose(projector_from_world, inverse(camera_from_world)),
-        )
-
-
-def _pinhole(model: PinholeModel) -> Pinhole:
-    return Pinhole(model.K, model.distortion, model.width_px, model.height_px)
-
-
-def _transform(pose: Pose) -> RigidTransform:
-    return RigidTransform(pose.R, pose.t_mm)
+        camera, projector = require_camera(calibration, name), pinhole(calibration.projector)
+        return cls(name, camera, projector, projector_from_camera)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,76 @@
+"""`unglare check-rig`: are all devices there, and do they see light."""
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from backend.cli.house import open_services
+from backend.cli.options import (
+    AsJson,
+    DataFolder,
+    RigName,
+    RigOptions,
+    Scene,
+    Seed,
+    Size,
+    parse_rig_options,
+)
+from backend.cli.output import answering, console, quiet_logging, table
+
+if TYPE_CHECKING:
+    from backend.services.rig_trial import RigTrial
+
+
+def register(application: typer.Typer) -> None:
+    """Add the commands of this module."""
+    application.command("check-rig")(check_rig)
+
+
+def check_rig(
+    rig: RigName = "simulated",
+    scene: Scene = None,
+    size: Size = None,
+    seed: Seed = None,
+    rig_options: RigOptions = None,
+    data: DataFolder = None,
+    as_json: AsJson = False,
+) -> None:
+    """Open a rig, show its devices, and take one test frame with each camera."""
+    from backend.services.rig_trial import try_rig
+
+    quiet_logging()
+    with answering(as_json) as answer:
+        options = parse_rig_options(rig_options, scene=scene, size=size, seed=seed)
+        with open_services(data) as services:
+            found = try_rig(services.context, rig, options)
+        answer.update(found.document())
+        if not as_json:
+            _show(found)
+        if found.problems:
+            answer["error"] = found.problems[0]
+
+
+def _show(found: "RigTrial") -> None:
+    out = console()
+    out.print(f"rig {found.name}: {found.info}")
+    rows = table("device", "who", "what")
+    for device in found.devices:
+        rows.add_row(device.name, device.who, device.abilities)
+    out.print(rows)
+    frames = table("camera", ">size", ">bits", ">exposure", ">mean", ">brightest", ">saturated")
+    for frame in found.frames:
+        frames.add_row(
+            frame.camera,
+            f"{frame.width_px}x{frame.height_px}",
+            str(frame.bits),
+            f"{frame.exposure_ms:.2f} ms",
+            f"{frame.mean_gray:.1f}",
+            f"{frame.brightest_gray:.0f}",
+            f"{frame.saturated_share:.2%}",
+        )
+    out.print(frames)
+    out.print(found.calibration)
+    for problem in found.problems:
+        out.print(f"problem: {problem}")
+    if not found.problems:
+        out.print("no problems found")

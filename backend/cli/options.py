@@ -1,0 +1,136 @@
+"""Options that several commands share, and what they mean."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from backend.domain.errors import InvalidSettingError
+
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="STAGE.FIELD=VALUE",
+        help="Set one field of a stage's settings, e.g. exposures.budget=fast; JSON or text. Repeatable.",
+    ),
+]
+RigName = Annotated[
+    str,
+    typer.Option(
+        "--rig", help="simulated, the name of an installed rig, or package.module:factory."
+    ),
+]
+RigOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--rig-option",
+        metavar="KEY=VALUE",
+        help="One option of the rig, e.g. bit_depth=12; JSON or text. Repeatable.",
+    ),
+]
+Scene = Annotated[
+    str | None,
+    typer.Option(
+        help="Scene of the simulated rig: high-contrast, metal, workpieces, plane, sphere, step, "
+        "sprayed:NAME, mesh:FILE.  [default: high-contrast]",
+        show_default=False,
+    ),
+]
+Size = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WIDTHxHEIGHT",
+        help="Size of the simulated cameras.  [default: 1280x960]",
+        show_default=False,
+    ),
+]
+Seed = Annotated[
+    int | None, typer.Option(help="Seed of the simulated noise.  [default: 0]", show_default=False)
+]
+DataFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--data",
+        help="Folder of database and artifacts.  [default: UNGLARE_DATA_FOLDER or ~/.local/share/unglare]",
+        show_default=False,
+    ),
+]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object last, and nothing else.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
+
+
+def parse_value(text: str) -> Any:
+    """Read a value as JSON, as a list of JSON values, or else as text.
+
+    Examples
+    --------
+    >>> parse_value("3"), parse_value("null"), parse_value("16.7, 100"), parse_value("fast")
+    (3, None, [16.7, 100], 'fast')
+    """
+    for attempt in (text, f"[{text}]" if "," in text else text):
+        try:
+            return json.loads(attempt, parse_constant=_refuse_constant)
+        except ValueError:
+            continue
+    return text
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(name)  # NaN and Infinity are no JSON
+
+
+def parse_settings(texts: Iterable[str] | None) -> dict[str, dict[str, Any]]:
+    """Read `STAGE.FIELD=VALUE`, the last one of a field counts.
+
+    Raises
+    ------
+    InvalidSettingError
+        Naming the text that isn't of that form.
+
+    Examples
+    --------
+    >>> parse_settings(["zones.gap_gray=9", "exposures.exposures_ms=10,20"])
+    {'zones': {'gap_gray': 9}, 'exposures': {'exposures_ms': [10, 20]}}
+    """
+    settings: dict[str, dict[str, Any]] = {}
+    for text in texts or ():
+        path, equals, value = text.partition("=")
+        stage, dot, field = path.strip().partition(".")
+        if not (equals and dot and stage and field):
+            raise InvalidSettingError(
+                f"--set {text} can't be read: write STAGE.FIELD=VALUE, e.g. exposures.budget=fast "
+                "(unglare methods shows stages and fields)."
+            )
+        settings.setdefault(stage, {})[field] = parse_value(value.strip())
+    return settings
+
+
+def parse_rig_options(
+    texts: Iterable[str] | None,
+    *,
+    scene: str | None = None,
+    size: str | None = None,
+    seed: int | None = None,
+) -> dict[str, Any]:
+    """Read `KEY=VALUE` and put the options of the simulated rig with them, as far as they are given.
+
+    Raises
+    ------
+    InvalidSettingError
+        Naming the text that isn't of that form.
+    """
+    named = {"scene": scene, "size": size, "seed": seed}
+    options = {name: value for name, value in named.items() if value is not None}
+    for text in texts or ():
+        key, equals, value = text.partition("=")
+        if not (equals and key.strip()):
+            raise InvalidSettingError(
+                f"--rig-option {text} can't be read: write KEY=VALUE, e.g. bit_depth=12."
+            )
+        options[key.strip()] = parse_value(value.strip())
+    return options

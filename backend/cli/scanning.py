@@ -1,0 +1,172 @@
+"""`unglare scan`: a whole scan, unattended."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from backend.cli.house import open_services, who
+from backend.cli.options import (
+    AsJson,
+    DataFolder,
+    Quiet,
+    RigName,
+    RigOptions,
+    Scene,
+    Seed,
+    Settings,
+    Size,
+    parse_rig_options,
+    parse_settings,
+)
+from backend.cli.output import Document, ProgressLines, answering, console, quiet_logging, table
+
+if TYPE_CHECKING:
+    from backend.contract.scans import ScanState, StageState
+    from backend.services.services import Services
+
+Out = Annotated[
+    Path | None, typer.Option(help="Write scan.json, cloud.ply and maps into this folder.")
+]
+WithFrames = Annotated[
+    bool, typer.Option("--frames", help="Also write the captured frames in the import format.")
+]
+
+
+def register(application: typer.Typer) -> None:
+    """Add the commands of this module."""
+    application.command()(scan)
+
+
+def scan(
+    rig: RigName = "simulated",
+    scene: Scene = None,
+    method: Annotated[
+        str, typer.Option(help="Measuring method, see unglare methods.")
+    ] = "hdr-fringe",
+    settings: Settings = None,
+    size: Size = None,
+    seed: Seed = None,
+    rig_options: RigOptions = None,
+    preset: Annotated[str | None, typer.Option(help="Named set of settings of the method.")] = None,
+    name: Annotated[str, typer.Option(help="Name of the scan.")] = "",
+    out: Out = None,
+    frames: WithFrames = False,
+    resume: Annotated[
+        str | None, typer.Option(metavar="SCAN", help="Go on with a scan that was interrupted.")
+    ] = None,
+    data: DataFolder = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a scan unattended: review gates pass on ok or warning, and stop on failure."""
+    from backend.contract.requests import CreateScan
+
+    quiet_logging()
+    with answering(as_json) as answer, ProgressLines(hidden=quiet) as progress:
+        request = CreateScan(
+            method=method,
+            rig=rig,
+            rig_options=parse_rig_options(rig_options, scene=scene, size=size, seed=seed),
+            name=name,
+            preset=preset,
+            settings=parse_settings(settings),
+        )
+        with open_services(data, progress) as services:
+            progress.step("rig", 0.0, "opening")
+            chosen = resume or services.create_scan(request, who()).id
+            run_and_export(services, chosen, answer, progress, out=out, frames=frames)
+    if not as_json:
+        show_summary(answer)
+
+
+def run_and_export(
+    services: "Services",
+    scan_id: str,
+    answer: Document,
+    progress: ProgressLines,
+    *,
+    out: Path | None,
+    frames: bool,
+) -> None:
+    """Run a scan to its end, export it, and write what came of it into the answer."""
+    from backend.contract.requests import StartRun
+
+    answer.update({"scan": scan_id, "status": "running"})
+    if out is not None:
+        services.refuse_export(str(out))  # not after minutes of capturing
+    try:
+        services.run(scan_id, StartRun(unattended=True), who())
+    finally:
+        answer.update(describe_scan(services.scan(scan_id)))
+    if answer.get("error"):
+        return
+    if out is not None:
+        files = services.export(scan_id, str(out), frames, who(), progress.part("export"))
+        answer["files"] = [str(file) for file in files]
+    answer.update(services.report(scan_id).document())
+    progress.finish()
+
+
+def describe_scan(state: "ScanState") -> Document:
+    """Write a scan's state as the answer has it."""
+    job = state.job
+    status = job.status.value if job else state.status
+    answer: Document = {
+        "scan": state.id,
+        "name": state.name,
+        "method": state.method,
+        "rig": state.rig,
+        "status": status,
+        "stages": [_describe_stage(stage) for stage in state.stages],
+        "duration_s": round(sum(s.duration_s or 0.0 for s in state.stages), 3),
+        "points": None,
+        "files": [],
+    }
+    if job and job.error:
+        answer["error"] = job.error
+    return answer
+
+
+def _describe_stage(stage: "StageState") -> Document:
+    return {
+        "name": stage.name,
+        "status": stage.status.value,
+        "message": stage.message,
+        "duration_s": None if stage.duration_s is None else round(stage.duration_s, 3),
+        "checks": [check.model_dump(mode="json") for check in stage.checks],
+        "result_hash": stage.result_hash,
+    }
+
+
+def show_summary(answer: Document) -> None:
+    """Print what a person wants to know of a finished scan."""
+    out = console()
+    rows = table("stage", "status", ">time", "finding")
+    for stage in answer["stages"]:
+        took = "" if stage["duration_s"] is None else f"{stage['duration_s']:.2f} s"
+        rows.add_row(stage["name"], stage["status"].replace("_", " "), took, stage["message"])
+    out.print(rows)
+    out.print(f"scan {answer['scan']}: {answer['status']}, {_points(answer['points'])}")
+    for name, figures in {"all": answer.get("truth"), **answer.get("parts", {})}.items():
+        if figures:
+            out.print(f"  {name}: {truth_words(figures)}")
+    if answer["files"]:
+        out.print(f"written to {Path(answer['files'][0]).parent}")
+
+
+def truth_words(figures: dict[str, Any]) -> str:
+    """Say how near to the truth a cloud is."""
+
+    def number(name: str, form: str, unit: str) -> str:
+        value = figures[name]
+        return "none" if value is None else f"{value:{form}}{unit}"
+
+    return (
+        f"{number('completeness', '.3%', '')} complete, {number('outlier_share', '.3%', '')} outliers, "
+        f"rms {number('rms_mm', '.4f', ' mm')}, median {number('median_mm', '.4f', ' mm')}"
+    )
+
+
+def _points(count: int | None) -> str:
+    return "no cloud" if count is None else f"{count:,} points".replace(",", " ")

@@ -1,0 +1,382 @@
+"""The same scene by several exposure strategies, with figures and pictures: the paper's figures 4 and 7."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from backend.contract.requests import CreateScan, EditSettings, StartRun
+from backend.domain.errors import UnglareError
+from backend.domain.frames import Frame
+from backend.domain.shots import Progress
+from backend.jobs.loading import LoadedScan, load_scan
+from backend.numerics.scoring import Score, Scores
+from backend.services import editing, running, scans
+from backend.services.context import Context
+from backend.services.export_folder import FolderKind, refuse_foreign, whole_folder
+from backend.services.previews import draw
+from backend.services.reporting import document_of, report, truth_document
+from backend.stages.cloud import Cloud
+from backend.stages.exposures import Exposures
+from backend.stages.fringe_capture import FringeFrames
+from backend.stages.fringe_phase import AbsolutePhase
+from backend.stages.pre_exposure import Preview
+from backend.storage.codec import decode
+
+METHOD = "hdr-fringe"
+COMPARISON = FolderKind("comparison.json", "unglare-comparison")
+_WHO = "compare"
+_PANEL_PX = 360
+_CAPTION_PX = 22
+_INK = (230, 230, 230)
+_PAPER = (30, 25, 22)
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """One way to choose exposures and to fuse them."""
+
+    name: str
+    title: str
+    settings: Mapping[str, Mapping[str, Any]]
+    """`{stage: {field: value}}`; fields of other strategies go back to their defaults."""
+    time_of: str | None = None
+    """Strategy whose light time is this one's budget."""
+
+
+STRATEGIES = (
+    Strategy("planned", "planned exposures, weighted fusion (default)", {}),
+    Strategy(
+        "paper",
+        "one exposure per zone, fused by zone masks (the paper's)",
+        {
+            "exposures": {"strategy": "hdrsia"},
+            "fusion": {"strategy": "masks"},
+            "fringe_phase": {"unwrapping": "cascade"},
+        },
+    ),
+    Strategy(
+        "planned_same_time", "planned exposures within the paper's light time", {}, time_of="paper"
+    ),
+    Strategy(
+        "paper_weighted",
+        "the paper's exposures, weighted fusion",
+        {"exposures": {"strategy": "hdrsia"}},
+    ),
+    Strategy("single_low", "one low exposure", {"exposures": {"strategy": "single_low"}}),
+    Strategy("single_high", "one high exposure", {"exposures": {"strategy": "single_high"}}),
+)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What one strategy reached."""
+
+    strategy: Strategy
+    error: str | None = None
+    """Why it reached nothing."""
+    exposures_ms: tuple[float, ...] = ()
+    light_s: float | None = None
+    """Exposure time of all fringes."""
+    total_s: float | None = None
+    """Light of the preview's and of all fringes, plus the time of computing."""
+    points: int | None = None
+    scores: Scores | None = None
+    panels: Mapping[str, Picture] = field(default_factory=dict)
+    """Pictures of the reference camera by caption."""
+
+
+def compare(
+    context: Context,
+    scene_options: Mapping[str, Any],
+    *,
+    rig: str = "simulated",
+    strategies: Sequence[Strategy] = STRATEGIES,
+    progress: Progress | None = None,
+) -> tuple[Compared, ...]:
+    """Measure one scene by every strategy, as edits of one scan: equal shots are taken once.
+
+    Parameters
+    ----------
+    context
+        Database, store, rigs; its runner has to return from `start` when the job has ended.
+    scene_options
+        Options of the rig: scene, size, seed ...
+    rig
+        Has to know the truth for more than points and times.
+    strategies
+        What is compared, in this order.
+    progress
+        Is told the strategy.
+
+    Raises
+    ------
+    UnglareError
+        If the scan can't be made; what goes wrong in one strategy is said in its row.
+    """
+    name = f"Comparison on {scene_options.get('scene', 'the default scene')}"
+    request = CreateScan(method=METHOD, rig=rig, rig_options=dict(scene_options), name=name)
+    scan = scans.create_scan(context, request, _WHO).id
+    results: dict[str, Compared] = {}
+    for number, strategy in enumerate(strategies):
+        if progress:
+            progress(number / len(strategies), strategy.name)
+        results[strategy.name] = _measure(context, scan, strategy, results)
+    return tuple(results.values())
+
+
+def _measure(
+    context: Context, scan: str, strategy: Strategy, earlier: Mapping[str, Compared]
+) -> Compared:
+    budget_s = earlier[strategy.time_of].light_s if strategy.time_of else None
+    if strategy.time_of and budget_s is None:
+        return Compared(strategy, f"{strategy.time_of} took no time that could be given to it.")
+    try:
+        _choose(context, scan, strategy, budget_s)
+        state = running.run(context, scan, StartRun(unattended=True), _WHO)
+    except UnglareError as error:
+        return Compared(strategy, error.sentence)
+    if state.job and state.job.error:
+        return Compared(strategy, state.job.error)
+    return _collect(context, scan, strategy)
+
+
+def _choose(context: Context, scan: str, strategy: Strategy, budget_s: float | None) -> None:
+    """Edit the settings that strategies differ in; all others stay as they are."""
+    wanted: dict[str, dict[str, Any]] = {s: dict(f) for s, f in strategy.settings.items()}
+    if budget_s is not None:
+        wanted.setdefault("exposures", {})["budget_s"] = budget_s
+    touched: dict[str, set[str]] = {"exposures": {"budget_s"}}
+    for other in STRATEGIES:
+        for stage, fields in other.settings.items():
+            touched.setdefault(stage, set()).update(fields)
+    for stage, names in touched.items():
+        changes = wanted.get(stage, {})
+        request = EditSettings(
+            changes=changes,
+            reset=tuple(sorted(names - set(changes))),
+            reason=strategy.title,
+            revision=_revision(context, scan),
+        )
+        editing.edit(context, scan, stage, request, _WHO)
+
+
+def _revision(context: Context, scan: str) -> int:
+    with context.database.reading() as repositories:
+        return repositories.scans.get(scan).revision
+
+
+def _collect(context: Context, scan: str, strategy: Strategy) -> Compared:
+    figures = report(context, scan)
+    with context.database.reading() as repositories:
+        loaded = load_scan(repositories, context.registry, scan)
+
+        def result(kind: type) -> Any:
+            return decode(_document(loaded, kind, repositories), kind, context.store)
+
+        preview: Preview = result(Preview)
+        exposures: Exposures = result(Exposures)
+        fringes: FringeFrames = result(FringeFrames)
+        phase: AbsolutePhase = result(AbsolutePhase)
+        cloud: Cloud = result(Cloud)
+    return Compared(
+        strategy=strategy,
+        exposures_ms=exposures.exposures_ms,
+        light_s=fringes.exposure_time_s,
+        total_s=fringes.exposure_time_s + _computing_s(loaded),
+        points=figures.points,
+        scores=figures.scores,
+        panels=_panels(preview, fringes, phase, cloud),
+    )
+
+
+def _document(loaded: LoadedScan, kind: type, repositories: Any) -> Mapping[str, Any]:
+    for planned in loaded.plan.stages:
+        if planned.stage.output is kind and planned.result is not None:
+            return document_of(repositories, planned.result)
+    raise AssertionError(f"a finished run of {METHOD} has a {kind.__name__}")
+
+
+def _computing_s(loaded: LoadedScan) -> float:
+    runs = [p.run for p in loaded.plan.stages if p.run and not p.stage.captures]
+    return sum(run.duration_s or 0.0 for run in runs)
+
+
+# pictures
+
+
+def _panels(
+    preview: Preview, fringes: FringeFrames, phase: AbsolutePhase, cloud: Cloud
+) -> dict[str, Picture]:
+    """Draw the reference camera's pictures as the paper shows them."""
+    name = next(iter(cloud.depth_mm))
+    frames = [f for f in fringes.frames if f.camera == name]
+    shortest, longest = (extreme(frames, key=_exposure_ms) for extreme in (min, max))
+    return {
+        f"white field, {preview.t_pre_ms:.1f} ms": _picture(preview.white[name]),
+        f"fringe, {_exposure_ms(shortest):.1f} ms": _picture(shortest.gray),
+        f"fringe, {_exposure_ms(longest):.1f} ms": _picture(longest.gray),
+        "wrapped phase": _picture(
+            phase.wrapped_rad[name], colormap="twilight", low=-np.pi, high=np.pi
+        ),
+        "absolute phase": _picture(phase.projector_px[name], colormap="turbo"),
+        "depth of the points": _picture(cloud.depth_mm[name], colormap="turbo"),
+    }
+
+
+def _exposure_ms(frame: Frame) -> float:
+    return frame.exposure_ms or 0.0
+
+
+def _picture(values: np.ndarray[Any, np.dtype[Any]], **options: Any) -> Picture:
+    drawn = draw(np.asarray(values), max_px=_PANEL_PX, format="jpeg", **options)
+    return np.asarray(cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+
+
+def contact_sheet(results: Sequence[Compared]) -> Picture:
+    """Put the panels of one or several strategies side by side, a row for each."""
+    rows = [_row(result) for result in results if result.panels]
+    if not rows:
+        return np.full((_CAPTION_PX, _PANEL_PX, 3), _PAPER, np.uint8)
+    width = max(row.shape[1] for row in rows)
+    return np.vstack([_padded(row, width) for row in rows])
+
+
+def _row(result: Compared) -> Picture:
+    panels = [_captioned(caption, panel) for caption, panel in result.panels.items()]
+    pictures = np.hstack(panels)
+    return np.vstack([_line(headline(result), pictures.shape[1]), pictures])
+
+
+def headline(result: Compared) -> str:
+    """Say a strategy and its figures in one line."""
+    exposures = ", ".join(f"{t:.1f}" for t in result.exposures_ms)
+    text = f"{result.strategy.name}: {exposures} ms, light {result.light_s or 0:.1f} s"
+    if result.scores is None:
+        return text
+    total = result.scores.total
+    return (
+        f"{text}, {total.completeness:.2%} complete, {total.outlier_share:.3%} outliers, "
+        f"rms {total.rms_mm:.3f} mm"
+    )
+
+
+def _captioned(caption: str, panel: Picture) -> Picture:
+    return np.vstack([_line(caption, panel.shape[1]), panel])
+
+
+def _line(text: str, width_px: int) -> Picture:
+    line = np.full((_CAPTION_PX, width_px, 3), _PAPER, np.uint8)
+    cv2.putText(
+        line, text, (4, _CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA
+    )
+    return line
+
+
+def _padded(row: Picture, width_px: int) -> Picture:
+    missing = width_px - row.shape[1]
+    return np.pad(row, ((0, 0), (0, missing), (0, 0))) if missing else row
+
+
+# tables and files
+
+COLUMNS = (
+    "strategy",
+    "completeness",
+    "outlier_share",
+    "rms_mm",
+    "median_mm",
+    "points",
+    "light_s",
+    "total_s",
+    "exposures_ms",
+    "error",
+)
+
+
+def table_row(result: Compared) -> dict[str, Any]:
+    """Return one strategy's figures by column; what it didn't reach is None."""
+    total: Score | None = result.scores.total if result.scores else None
+    return {
+        "strategy": result.strategy.name,
+        "completeness": total.completeness if total else None,
+        "outlier_share": total.outlier_share if total else None,
+        "rms_mm": total.rms_mm if total else None,
+        "median_mm": total.median_mm if total else None,
+        "points": result.points,
+        "light_s": result.light_s,
+        "total_s": result.total_s,
+        "exposures_ms": list(result.exposures_ms),
+        "error": result.error,
+    }
+
+
+def part_rows(result: Compared) -> dict[str, Score]:
+    """Return the figures of each part of the scene."""
+    return dict(result.scores.parts) if result.scores else {}
+
+
+def write_comparison(folder: Path, results: Sequence[Compared]) -> tuple[Path, ...]:
+    """Write `comparison.csv`, a contact sheet per strategy, one of all, and `comparison.json`; return the files.
+
+    Raises
+    ------
+    ConflictError
+        If the folder holds anything else than an older comparison, or can't be written.
+    StorageFullError
+        If there is no room; nothing is left behind.
+    """
+    with whole_folder(folder, COMPARISON) as target:
+        target.write("comparison.csv", (_csv(results).encode(),))
+        for result in results:
+            if result.panels:
+                target.write(f"{result.strategy.name}.png", (_png(contact_sheet([result])),))
+        target.write("overview.png", (_png(contact_sheet(results)),))
+        document = {
+            "format": COMPARISON.format,
+            "version": 1,
+            "strategies": describe(results),
+            "files": dict(target.hashes),
+        }
+        target.write_json(COMPARISON.index_file, document)
+        names = sorted(target.hashes)
+    return tuple(folder / name for name in names)
+
+
+def refuse_folder(folder: Path) -> None:
+    """Raise `ConflictError` if a comparison can't be written there: before long work is done for it."""
+    refuse_foreign(folder.expanduser().absolute(), COMPARISON)
+
+
+def describe(results: Sequence[Compared]) -> list[dict[str, Any]]:
+    """Write all figures as JSON values."""
+    return [table_row(r) | {"title": r.strategy.title, **truth_document(r.scores)} for r in results]
+
+
+def _csv(results: Sequence[Compared]) -> str:
+    """Write the table: one line per strategy and one per strategy and part."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["strategy", "part", *COLUMNS[1:]])
+    for result in results:
+        row = table_row(result)
+        row["exposures_ms"] = " ".join(f"{t:.4g}" for t in result.exposures_ms)
+        writer.writerow([row["strategy"], "all", *(row[name] for name in COLUMNS[1:])])
+        for part, figures in part_rows(result).items():
+            known = [getattr(figures, name) for name in COLUMNS[1:5]]
+            writer.writerow([row["strategy"], part, *known, figures.accepted])
+    return text.getvalue()
+
+
+def _png(picture: Picture) -> bytes:
+    done, data = cv2.imencode(".png", picture)
+    assert done, "an uint8 picture of three channels can always be written"
+    return data.tobytes()
