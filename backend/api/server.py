@@ -74,7 +74,9 @@ def public_socket(host: str, port: int) -> socket.socket:
         raise StartupError(
             f"The address {host!r} isn't known ({error.strerror}); set UNGLARE_HOST to one of this machine."
         ) from error
-    listening = socket.socket(family, kind)
+    # Named, because asyncio switches Nagle's algorithm off only where it sees the protocol: else each
+    # answer waits 40 ms for the client's acknowledgement.
+    listening = socket.socket(family, kind, socket.IPPROTO_TCP)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):

@@ -1,5 +1,6 @@
 """The public port, and tokens that stay out of the log."""
 
+import asyncio
 import contextlib
 import logging
 import socket
@@ -24,6 +25,28 @@ def test_a_stalled_browser_is_cut_by_the_kernel() -> None:
                 option = accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
 
     assert option == 30_000
+
+
+def test_answers_dont_wait_for_the_clients_acknowledgement() -> None:
+    without_delay: list[int] = []
+
+    class Noting(asyncio.Protocol):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            accepted = transport.get_extra_info("socket")
+            without_delay.append(accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+            transport.close()
+
+    async def accept_one() -> None:
+        with contextlib.closing(public_socket("127.0.0.1", 0)) as listening:
+            server = await asyncio.get_running_loop().create_server(Noting, sock=listening)
+            reader, writer = await asyncio.open_connection(*listening.getsockname())
+            await reader.read()
+            writer.close()
+            server.close()
+
+    asyncio.run(accept_one())
+
+    assert without_delay == [1]
 
 
 def test_a_port_in_use_is_one_sentence_with_the_way_out() -> None:
