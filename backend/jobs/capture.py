@@ -344,5 +344,10 @@ class _Pace:
         count = len(self._light_s) - 1
         if done == 0 or count == 1:
             return None
-        overhead_s = max(0.0, (self._clock() - self._began - self._light_s[done]) / done)
-        return float(self._light_s[-1] - self._light_s[done] + overhead_s * (count - done))
+        light_s = self._light_s[done]
+        left_s = self._light_s[-1] - light_s
+        elapsed_s = self._clock() - self._began
+        if elapsed_s < light_s:
+            # Faster than light: a simulated rig doesn't wait for its exposures.
+            return float(left_s * elapsed_s / light_s)
+        return float(left_s + (elapsed_s - light_s) / done * (count - done))

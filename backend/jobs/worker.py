@@ -46,6 +46,11 @@ class _Stop:
 
 
 @dataclass(frozen=True)
+class _Ready:
+    """From the worker: everything is loaded and compiled."""
+
+
+@dataclass(frozen=True)
 class _Progress:
     done: float
     text: str
@@ -60,7 +65,7 @@ class _Failure:
     """The traceback, if it is a defect."""
 
 
-_Report = _Progress | _Failure | Outcome
+_Report = _Ready | _Progress | _Failure | Outcome
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,8 @@ class Worker:
             self._respawn()
         number = next(self._numbers)
         self._send(_Order(number, task))
+        if not self._ready:
+            control.note("waits for the worker process; after an update it compiles first")
         with control.when_stopped(lambda: self._send(_Stop(number))):
             report = self._listen(task, control)
         if isinstance(report, Outcome):
@@ -135,9 +142,12 @@ class Worker:
                 report: _Report = self._pipe.recv()
             except (EOFError, OSError):
                 raise self._died(task, control) from None
-            if not isinstance(report, _Progress):
+            if isinstance(report, _Ready):
+                self._ready = True
+                control.note("")
+            elif not isinstance(report, _Progress):
                 return report
-            if not control.stopping:
+            elif not control.stopping:
                 control.progress(report.done, report.text)
 
     def _died(self, task: StageTask, control: JobControl) -> UnglareError:
@@ -168,6 +178,7 @@ class Worker:
         )
         self._process.start()
         theirs.close()
+        self._ready = False
 
     def _respawn(self) -> None:
         self.close()
@@ -221,6 +232,7 @@ def _work(pipe: Connection, setup: WorkerSetup) -> None:
     registry = setup.registry()
     if setup.warm_up:
         setup.warm_up()
+    pipe.send(_Ready())
     while True:
         order = orders.get()
         pipe.send(_carry_out(order, pipe, registry, setup.store, stopped))

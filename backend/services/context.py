@@ -5,11 +5,12 @@ from dataclasses import dataclass, field
 from datetime import datetime
 
 from backend.contract.rigs import RigOffer
+from backend.contract.scans import ScanSummary
 from backend.jobs.rigs import RigPool
 from backend.jobs.runner import Runner
 from backend.methods import Registry
 from backend.services.events import EventHub
-from backend.services.previews import PreviewCache
+from backend.services.memory import Memory
 from backend.services.rig_offers import offer_rigs
 from backend.storage.artifacts import ArtifactStore
 from backend.storage.database import Database, utc_now
@@ -30,4 +31,7 @@ class Context:
     rig_patience_s: float = 0.05
     """How long a new scan waits for its rig's facts; later they come by themselves."""
     offers: Callable[[], tuple[RigOffer, ...]] = offer_rigs
-    previews: PreviewCache = field(default_factory=PreviewCache)
+    previews: Memory[bytes] = field(default_factory=lambda: Memory(64 << 20, len))
+    """Pictures for the screen, up to so many bytes."""
+    summaries: Memory[ScanSummary] = field(default_factory=lambda: Memory(10_000))
+    """Lines of the scan list."""

@@ -1,9 +1,6 @@
-"""Arrays as pictures for the screen, made with OpenCV and remembered while they are looked at."""
+"""Arrays as pictures for the screen, made with OpenCV and in the colours of the station's legends."""
 
 import math
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
 from typing import Any, Literal
 
 import cv2
@@ -203,28 +200,3 @@ def _json(value: Any) -> Any:
     if isinstance(value, list):
         return [_json(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-class PreviewCache:
-    """The pictures drawn last, up to so many bytes."""
-
-    def __init__(self, capacity_bytes: int = 64 << 20) -> None:
-        self._capacity_bytes = capacity_bytes
-        self._size_bytes = 0
-        self._lock = threading.Lock()
-        self._pictures: OrderedDict[Hashable, bytes] = OrderedDict()
-
-    def get(self, key: Hashable, make: Callable[[], bytes]) -> bytes:
-        """Return the picture of a key, made now if it isn't remembered."""
-        with self._lock:
-            if key in self._pictures:
-                self._pictures.move_to_end(key)
-                return self._pictures[key]
-        picture = make()
-        with self._lock:
-            if key not in self._pictures and len(picture) <= self._capacity_bytes:
-                self._pictures[key] = picture
-                self._size_bytes += len(picture)
-            while self._size_bytes > self._capacity_bytes:
-                self._size_bytes -= len(self._pictures.popitem(last=False)[1])
-        return picture

@@ -70,11 +70,21 @@ def create_scan(context: Context, request: CreateScan, who: str) -> ScanState:
 
 
 def list_scans(context: Context, limit: int, offset: int, text: str) -> tuple[ScanSummary, ...]:
-    """Return a page of the scan list, newest first."""
+    """Return a page of the scan list, newest first.
+
+    A line is put together only when something has happened to its scan: that always is a line in the audit trail.
+    """
     with context.database.reading() as repositories:
         rows = repositories.scans.list(limit, offset, text)
         jobs = repositories.jobs.last_of_each([row.id for row in rows])
-        return tuple(scan_summary(context, repositories, row, jobs.get(row.id)) for row in rows)
+        happened = repositories.audit.last_of_each([row.id for row in rows])
+
+        def summary(row: ScanRow) -> ScanSummary:
+            job = jobs.get(row.id)
+            key = (row.id, happened.get(row.id), job.status if job else None)
+            return context.summaries.get(key, lambda: scan_summary(context, repositories, row, job))
+
+        return tuple(summary(row) for row in rows)
 
 
 def audit_trail(context: Context, scan: str) -> tuple[AuditEntry, ...]:

@@ -493,6 +493,10 @@ def test_scans_are_listed_with_where_they_stand(house: House) -> None:
     assert (cover.name, cover.status, cover.stages_done, cover.stages) == ("cover", "idle", 0, 5)
     assert (bracket.id, bracket.status, bracket.stages_done) == (first.id, "done", 5)
     assert bracket.points == 24 * 16
+    assert house.services.scans()[1] is bracket, "nothing has happened to it"
+    house.edit(first, "toy_cloud", scale_mm=2.0)
+    changed = house.services.scans()[1]
+    assert (changed.status, changed.stages_done, changed.points) == ("idle", 4, None)
     assert [s.name for s in house.services.scans(text="brack")] == ["bracket"]
     assert [s.name for s in house.services.scans(limit=1, offset=1)] == ["bracket"]
 

@@ -11,7 +11,6 @@ from backend.domain.errors import InvalidSettingError, NotFoundError
 from backend.services.previews import (
     BACKGROUND_RGB,
     LABEL_COLOURS,
-    PreviewCache,
     draw,
     live_jpeg,
     value_at,
@@ -126,19 +125,3 @@ def test_a_pixel_says_its_value() -> None:
     for x, y in ((2, 0), (0, 2), (-1, 0)):
         with pytest.raises(NotFoundError, match=f"has no pixel at x {x}, y {y}"):
             value_at(values, x, y)
-
-
-def test_the_cache_forgets_what_was_looked_at_longest_ago() -> None:
-    cache, made = PreviewCache(capacity_bytes=30), []
-
-    def picture(name: str) -> bytes:
-        def make() -> bytes:
-            made.append(name)
-            return name.encode() * 10
-
-        return cache.get(name, make)
-
-    for name in "abcabdabca":
-        assert picture(name) == name.encode() * 10
-    assert made == ["a", "b", "c", "d", "c"]
-    assert cache.get("large", lambda: b"x" * 31) == b"x" * 31

@@ -1,10 +1,10 @@
 """The audit trail: a table that only grows."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from backend.storage import tables
@@ -48,3 +48,12 @@ class AuditTrail:
             select(tables.Audit).where(tables.Audit.scan == scan).order_by(tables.Audit.sequence)
         )
         return [as_row(AuditRow, record) for record in self._session.scalars(query)]
+
+    def last_of_each(self, scans: Iterable[str]) -> dict[str, int]:
+        """Return the number of the newest line of each of the scans: whatever happens to a scan raises it."""
+        query = (
+            select(tables.Audit.scan, func.max(tables.Audit.sequence))
+            .where(tables.Audit.scan.in_(list(scans)))
+            .group_by(tables.Audit.scan)
+        )
+        return dict(self._session.execute(query).tuples())
