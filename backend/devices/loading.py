@@ -75,6 +75,20 @@ def open_rig(name: str, options: Mapping[str, object] | None = None) -> Rig:
     return opened
 
 
+def options_schema(name: str) -> dict[str, Any]:
+    """Return the JSON schema of a rig's options, empty where its factory doesn't say.
+
+    A factory says it by an attribute `options_model`: the pydantic model of the mapping that it takes.
+
+    Raises
+    ------
+    RigNotFoundError
+        If there is no such rig, module or factory.
+    """
+    model = getattr(_factory(name), "options_model", None)
+    return model.model_json_schema() if model else {}
+
+
 def _factory(name: str) -> Callable[[Mapping[str, object]], Any]:
     if name == "simulated":
         from backend.devices.sim import create_rig  # numba and scipy: only when it is used

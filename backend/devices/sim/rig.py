@@ -40,6 +40,9 @@ def create_rig(config: Mapping[str, object]) -> "SimulatedRig":
     return SimulatedRig(SimulatedRigConfig.from_options(config))
 
 
+create_rig.options_model = SimulatedRigConfig  # type: ignore[attr-defined]  # read by loading.options_schema
+
+
 class SimulatedRig:
     """A `Rig` that knows the truth. The scene is cast when the rig is opened: seconds, once per process."""
 

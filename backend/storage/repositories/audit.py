@@ -56,4 +56,4 @@ class AuditTrail:
             .where(tables.Audit.scan.in_(list(scans)))
             .group_by(tables.Audit.scan)
         )
-        return dict(self._session.execute(query).tuples())
+        return {scan: int(sequence) for scan, sequence in self._session.execute(query)}
