@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int16, Integer
-from scipy.ndimage import binary_dilation
 
 from backend.numerics.errors import NumericsError
 
@@ -243,9 +242,18 @@ def edge_band(
         edges[near] |= cut
         edges[far] |= cut
     # Both pixels beside the edge are half a pixel from it already.
-    size = 2 * width_px - 1
-    band: Bool[np.ndarray, "h w"] = binary_dilation(edges, np.ones((size, size), bool))
-    return band
+    for _ in range(width_px - 1):
+        edges = _grown(_grown(edges, 0), 1)
+    return edges
+
+
+def _grown(mask: Bool[np.ndarray, "h w"], axis: int) -> Bool[np.ndarray, "h w"]:
+    """Also mark both neighbours along an axis."""
+    near, far = _neighbours(axis)
+    grown = mask.copy()
+    grown[near] |= mask[far]
+    grown[far] |= mask[near]
+    return grown
 
 
 def _neighbours(axis: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:

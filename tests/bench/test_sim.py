@@ -1,5 +1,7 @@
 """What a frame of the simulated rig costs, as times and as ratio to copying a large array."""
 
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -21,9 +23,18 @@ def rig(request):
         yield rig
 
 
+def seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
 @pytest.mark.parametrize("exposure_ms", [25.0, 600.0], ids=["dark", "saturated"])
 def test_a_frame(benchmark, rig, exposure_ms):
-    """One camera, a new pattern each time: the budget is 150 ms at 1280x960."""
+    """One camera, a new pattern each time: the budget is 150 ms at 1280x960.
+
+    That is on a machine that copies 256 MiB in 23 ms when idle; a busy one gets as much more.
+    """
     camera = rig.cameras["left"]
     camera.configure(replace(camera.settings, exposure_us=1000 * exposure_ms))
     camera.arm()
@@ -36,9 +47,12 @@ def test_a_frame(benchmark, rig, exposure_ms):
 
     shot()
     benchmark.pedantic(shot, rounds=15)
+    source, target = np.ones(1 << 25), np.empty(1 << 25)
+    times = [(seconds(shot), seconds(lambda: np.copyto(target, source))) for _ in range(15)]
     camera.disarm()
     if rig.config.size == (1280, 960):
-        assert benchmark.stats.stats.median < 0.15
+        frame_s, copy_s = np.median(times, axis=0)
+        assert frame_s < 0.15 * max(1.0, copy_s / 0.023)
 
 
 def test_copying_256_mib(benchmark):

@@ -1,5 +1,7 @@
 """The simulated rig as a whole: determinism, settings, faults on request, truth."""
 
+import threading
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +16,7 @@ from backend.devices.errors import (
 )
 from backend.devices.protocols import KnowsTruth, LinkState, TriggerSource
 from backend.devices.sim import create_rig
+from backend.devices.sim.clock import Clock
 
 SMALL = {"scene": "plane", "size": "160x120", "projector_size": "160x100"}
 
@@ -225,3 +228,24 @@ def test_hot_pixels_read_full_scale_always(opened):
     hot = [np.flatnonzero(shoot(rig, level=0, exposure_ms=1.0).data == 255) for _ in range(2)]
     assert len(hot[0]) == pytest.approx(19, abs=1)
     np.testing.assert_array_equal(hot[0], hot[1])
+
+
+def test_a_virtual_clock_runs_forward_only():
+    clock = Clock(realtime=False)
+    clock.wait_until(5.0, threading.Event())
+    clock.wait_until(3.0, threading.Event())
+    assert clock.now_s() == 5.0
+
+
+def test_waiting_in_real_time_ends_when_cancelled():
+    clock, cancelled = Clock(realtime=True), threading.Event()
+    cancelled.set()
+    clock.wait_until(1000.0, cancelled)
+    assert clock.now_s() < 100.0
+
+
+def test_a_real_time_rig_takes_the_exposures_time(opened):
+    rig = opened(realtime=True)
+    start = time.monotonic()
+    shoot(rig, exposure_ms=50.0)
+    assert time.monotonic() - start >= 0.05

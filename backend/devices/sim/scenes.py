@@ -159,7 +159,7 @@ def _workpieces() -> Scene:
     parts = {
         "table": (table, TABLE),
         "black": (_housing().moved(-104, 8, 0, turn_deg=(0, 0, 12)), BLACK_PLASTIC),
-        "dark": (_pulley().moved(2, 26, 0), DARK_CAST),
+        "dark": (_bearing_block().moved(2, 26, 0), DARK_CAST),
         "shiny": (_step_block().moved(100, -14, 0, turn_deg=(0, 0, -14)), MACHINED),
     }
     return Scene(
@@ -181,8 +181,8 @@ def _housing() -> Mesh:
     return join([body, collar, *sockets, *ribs, flange])
 
 
-def _pulley() -> Mesh:
-    """Make a cast wheel lying on z = 0: rim, web, hub, four bosses."""
+def _bearing_block() -> Mesh:
+    """Make a cast bearing block lying on z = 0: round recess, hub, four bosses."""
     web = cylinder(44, 12, chamfer=1.5).moved(0, 0, 6)
     rim = plate(92, 92, 20, [(0, 0, 36)]).moved(0, 0, 10)
     hub = cylinder(15, 34, chamfer=2).moved(0, 0, 17)
