@@ -232,10 +232,10 @@ def _work(pipe: Connection, setup: WorkerSetup) -> None:
     registry = setup.registry()
     if setup.warm_up:
         setup.warm_up()
-    pipe.send(_Ready())
+    _report(pipe, _Ready())
     while True:
         order = orders.get()
-        pipe.send(_carry_out(order, pipe, registry, setup.store, stopped))
+        _report(pipe, _carry_out(order, pipe, registry, setup.store, stopped))
 
 
 def _receive(pipe: Connection, orders: "queue.SimpleQueue[_Order]", stopped: set[int]) -> None:
@@ -251,6 +251,14 @@ def _receive(pipe: Connection, orders: "queue.SimpleQueue[_Order]", stopped: set
             orders.put(message)
 
 
+def _report(pipe: Connection, report: _Report) -> None:
+    try:
+        pipe.send(report)
+    except OSError:
+        # The parent is gone, and nobody wants the result.
+        os._exit(0)
+
+
 def _carry_out(
     order: _Order, pipe: Connection, registry: Registry, store: ArtifactStore, stopped: set[int]
 ) -> Outcome | _Failure:
@@ -262,7 +270,7 @@ def _carry_out(
             raise CancelledError("Cancelled.")
         if time.monotonic() - told >= REPORT_PERIOD_S:
             told = time.monotonic()
-            pipe.send(_Progress(done, text))
+            _report(pipe, _Progress(done, text))
 
     try:
         return perform(order.task, registry, store, progress)
