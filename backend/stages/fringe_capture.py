@@ -62,12 +62,11 @@ def capture_plan(
     params: FringeCaptureParams,
     mask: IntensityMask | None = None,
 ) -> Plan[FringeFrames]:
-    """Take all patterns of one exposure as one burst, longest exposure last."""
-    frames: list[Frame] = []
-    for exposure_ms in sorted(exposures_ms):
-        exposed = yield _burst(patterns, exposure_ms, params, mask)
-        frames += [frame for shot in exposed for frame in shot.values()]
-    return fringe_frames(tuple(frames))
+    """Take everything as one burst, longest exposure last: nothing depends on a frame, so the time left is known."""
+    exposed = yield tuple(
+        shot for t in sorted(exposures_ms) for shot in _shots(patterns, t, params, mask)
+    )
+    return fringe_frames(tuple(frame for shot in exposed for frame in shot.values()))
 
 
 def fringe_frames(frames: tuple[Frame, ...]) -> FringeFrames:
@@ -83,7 +82,7 @@ def import_fringes(frames: tuple[Frame, ...]) -> FringeFrames:
     return fringe_frames(frames)
 
 
-def _burst(
+def _shots(
     patterns: tuple[Pattern, ...],
     exposure_ms: float,
     params: FringeCaptureParams,
