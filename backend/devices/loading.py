@@ -16,6 +16,7 @@ from backend.devices.protocols import Rig
 from backend.domain.errors import UnglareError
 
 GROUP = "unglare.rigs"
+_BUILT_IN = {"simulated": "backend.devices.sim:create_rig"}
 
 _REQUIRED = (
     *("name", "info", "cameras", "projector", "facts", "calibration"),
@@ -34,8 +35,8 @@ class RigEntry:
 
 def available_rigs() -> tuple[RigEntry, ...]:
     """Return the rigs that have a name, the built-in one first; nothing is imported."""
-    built_in = RigEntry("simulated", "unglare")
-    return (built_in, *(RigEntry(e.name, _package(e)) for e in _entries().values()))
+    built_in = (RigEntry(name, "unglare") for name in _BUILT_IN)
+    return (*built_in, *(RigEntry(e.name, _package(e)) for e in _entries().values()))
 
 
 def open_rig(name: str, options: Mapping[str, object] | None = None) -> Rig:
@@ -90,15 +91,12 @@ def options_schema(name: str) -> dict[str, Any]:
 
 
 def _factory(name: str) -> Callable[[Mapping[str, object]], Any]:
-    if name == "simulated":
-        from backend.devices.sim import create_rig  # numba and scipy: only when it is used
-
-        return create_rig
-    entry = _entries().get(name)
+    entry = None if name in _BUILT_IN else _entries().get(name)
     if entry is not None:
         return _loaded(name, entry.load)
-    if ":" in name:
-        module, _, attribute = name.partition(":")
+    place = _BUILT_IN.get(name, name)
+    if ":" in place:
+        module, _, attribute = place.partition(":")
         return _loaded(name, lambda: getattr(importlib.import_module(module), attribute))
     names = ", ".join(rig.name for rig in available_rigs())
     raise RigNotFoundError(

@@ -289,15 +289,20 @@ def _lit_by_mirror(
 def _near_facet(
     lighting: Lighting, triangle: Int32[np.ndarray, "n"], facet: Facet
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """Preselect points before the facet whose line to the image passes near it: casting costs more."""
-    point = lighting.point_mm.astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        above = (point - facet.point_mm) @ facet.normal
-        behind = (facet.point_mm - facet.image_mm) @ facet.normal
-        crossing = facet.image_mm + (point - facet.image_mm) * (behind / (behind + above))[:, None]
-        near = np.linalg.norm(crossing - facet.point_mm, axis=1) <= facet.radius_mm
-        facing = ((facet.image_mm - point) * lighting.normal).sum(axis=1) > 0
-        return np.flatnonzero((above > SHADOW_OFFSET_MM) & near & facing & (triangle >= 0))
+    """Preselect points before the facet whose line to the image passes near it: casting costs more.
+
+    Each test runs on what the one before left over; most points fall out at the first.
+    """
+    normal, image = facet.normal.astype(np.float32), facet.image_mm.astype(np.float32)
+    height = lighting.point_mm @ normal - np.float32(facet.point_mm @ facet.normal)
+    pixel = np.flatnonzero((triangle >= 0) & (height > SHADOW_OFFSET_MM))
+    towards = image - lighting.point_mm[pixel]
+    facing = np.einsum("nk,nk->n", towards, lighting.normal[pixel]) > 0
+    pixel, towards, height = pixel[facing], towards[facing], height[pixel[facing]]
+    depth = np.float32((facet.point_mm - facet.image_mm) @ facet.normal)
+    crossing = lighting.point_mm[pixel] + towards * (height / (height + depth))[:, None]
+    off = crossing - facet.point_mm.astype(np.float32)
+    return pixel[np.einsum("nk,nk->n", off, off) <= facet.radius_mm**2]
 
 
 __all__ = ["REFERENCE_MM", "Bounces", "Caster", "Facet", "Transport", "cast", "mirror_facets"]
