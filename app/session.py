@@ -116,7 +116,7 @@ class Session:
 
     def notify(self, title: str, body: str, *, colour: str = "blue") -> None:
         """Show a note that goes away by itself."""
-        self._client.add_notification(title, body, auto_close_seconds=_NOTE_S, color=colour)  # type: ignore[call-overload]
+        self._client.add_notification(title, body, auto_close_seconds=_NOTE_S, color=colour)  # type: ignore[call-overload]  # viser lists its colours, ours are some of them
 
     def open_scan(self, scan_id: str) -> None:
         """Show a scan."""
@@ -269,7 +269,7 @@ class Session:
             ("All scans", "H", None, self.go_home),
         ]
         for label, key, modifier, work in keys:
-            command = self._gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]
+            command = self._gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # keys as viser lists them
             _on_trigger(command, work)
 
     def _listen_to_clicks(self) -> None:

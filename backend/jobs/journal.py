@@ -37,7 +37,7 @@ class DatabaseJournal:
     def find(self, shot: str, occurrence: int) -> FrameRow | None:  # noqa: D102 (see Journal)
         return self._known.get((shot, occurrence))
 
-    def add(self, rows: Sequence[FrameRow]) -> None:  # noqa: D102
+    def add(self, rows: Sequence[FrameRow]) -> None:  # noqa: D102 (see Journal)
         with self._database.transaction() as repositories:
             for row in rows:
                 repositories.frames.add(row)

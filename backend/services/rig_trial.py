@@ -111,7 +111,7 @@ def _devices(rig: Rig) -> Iterator[TriedDevice]:
 
 
 def _who(info: DeviceInfo) -> str:
-    words = [info.vendor, info.model, info.serial, "(simulated)" if info.simulated else ""]
+    words = [info.vendor, info.model, info.serial]
     return " ".join(word for word in words if word)
 
 

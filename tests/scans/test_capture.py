@@ -336,7 +336,7 @@ def test_until_keeps_only_the_accepted_picture(bench: Bench) -> None:
         # Somebody opens the iris before the third picture.
         bench.rig.options["noise"] = False
         if shot == 3:
-            bench.rig.seen_by = lambda camera: np.full((16, 24), 200, np.uint8)  # type: ignore[method-assign]
+            bench.rig.seen_by = lambda camera: np.full((16, 24), 200, np.uint8)  # type: ignore[method-assign]  # on purpose
 
     bench.faults.before_shot = brighter
     (exposed,) = bench.drive(wait_plan("left"))

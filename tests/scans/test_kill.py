@@ -32,7 +32,7 @@ def house(tmp_path: Path) -> Iterator[House]:
 
 
 def start(target: object, house: House, scan: str, tmp_path: Path) -> BaseProcess:
-    process = CONTEXT.Process(target=target, args=(str(tmp_path), scan))  # type: ignore[arg-type]
+    process = CONTEXT.Process(target=target, args=(str(tmp_path), scan))  # type: ignore[arg-type]  # the tests' own functions
     process.start()
     return process
 
