@@ -302,7 +302,8 @@ def _near_facet(
     depth = np.float32((facet.point_mm - facet.image_mm) @ facet.normal)
     crossing = lighting.point_mm[pixel] + towards * (height / (height + depth))[:, None]
     off = crossing - facet.point_mm.astype(np.float32)
-    return pixel[np.einsum("nk,nk->n", off, off) <= facet.radius_mm**2]
+    near = np.einsum("nk,nk->n", off, off) <= facet.radius_mm**2
+    return np.asarray(pixel[near], np.int64)
 
 
 __all__ = ["REFERENCE_MM", "Bounces", "Caster", "Facet", "Transport", "cast", "mirror_facets"]
