@@ -286,6 +286,30 @@ def test_closing_interrupts_and_the_next_start_goes_on(
         assert house.rigs.shots + again.rigs.shots <= 5 + 8 + 1
 
 
+def test_ctrl_c_on_the_command_line_cancels_and_keeps_the_frames(house: House) -> None:
+    runner = house.services.context.runner
+    assert isinstance(runner, InlineRunner)
+
+    def press(shot: int) -> None:
+        if shot == 7:
+            (job,) = runner._started.values()
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+            assert job.execution.control._stopping.wait(WAIT_S)
+
+    house.rigs.faults.before_shot = press
+    scan = house.create().id
+    with pytest.raises(KeyboardInterrupt):
+        house.services.run(scan, StartRun(), "ada")
+    state = house.services.scan(scan)
+    assert state.job is not None
+    assert state.job.status == "cancelled"
+    assert statuses(state)["fringes"] == "pending"
+    house.rigs.faults.before_shot = lambda shot: None
+    taken = house.rigs.shots
+    assert waiting(house.run(scan)) is not None
+    assert house.rigs.shots < taken + 8
+
+
 def test_events_tell_every_change_and_not_too_many(local: House) -> None:
     scan = local.create().id
     local.run(scan)
