@@ -46,17 +46,16 @@ class Look:
 
     @property
     def active(self) -> StageState:
-        """The stage where something happens: it runs, or asks, or comes next; else the last one."""
+        """The stage where something happens: it runs, or asks, or comes next; else the last result."""
         stages = self.scan.stages
         if self.running and self.scan.job and (at := self.find(self.scan.job.stage)):
             return at
-        for stage in stages:
-            if stage.status in ASKING:
-                return stage
+        for statuses in (ASKING, frozenset({"pending"})):
+            for stage in stages:
+                if stage.status in statuses:
+                    return stage
         finished = [s for s in stages if s.status in FINISHED]
-        if not finished:
-            return stages[0]
-        return finished[-1]
+        return finished[-1] if finished else stages[0]
 
     @property
     def stage(self) -> StageState:

@@ -75,7 +75,7 @@ def _method() -> MethodDescription:
     ("statuses", "active"),
     [
         (("pending", "pending", "pending"), "first"),
-        (("done", "pending", "pending"), "first"),
+        (("done", "pending", "pending"), "second"),
         (("done", "awaiting_review", "pending"), "second"),
         (("done", "running", "pending"), "second"),
         (("accepted", "done", "done"), "third"),
