@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, Shaped, UInt16
 from backend.numerics import decoding_kernels as kernels
 from backend.numerics.errors import FrameError, FrequencyError
 from backend.numerics.fringe_orders import FringeOrders, hierarchical
-from backend.numerics.kernels import frame_stack, kernel_input
+from backend.numerics.kernels import frame_stack, kernel_input, new_work
 from backend.numerics.order_rows import CODE
 from backend.numerics.phasors import Phasors, steps_of
 from backend.numerics.sine_code import SineCode
@@ -122,6 +122,7 @@ def decode_frames(
     _check_maps(maps, stack.shape, noise is not None)
     settings = _settings(code, orders, limits or Limits(), size_px, black_gray)
     kernels.decode_frames(
+        new_work(),
         stack.addresses,
         stack.wide,
         stack.shape[0] * stack.shape[1],
@@ -206,6 +207,7 @@ def absolute_phase(
     settings = _settings(code, orders, limits or Limits(), size_px, black_gray)
     n_frequencies = len(code.periods)
     kernels.locate_phasors(
+        new_work(),
         kernel_input(phasors.in_phase_gray).reshape(n_frequencies, -1),
         kernel_input(phasors.quadrature_gray).reshape(n_frequencies, -1),
         kernel_input(phasors.mean_gray).reshape(n_frequencies, -1),

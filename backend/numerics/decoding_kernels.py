@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from backend.numerics.kernels import kernel, row_loop
+from backend.numerics.kernels import kernel, row_loop, take_next
 from backend.numerics.order_rows import (
     CODE,
     LATTICE,
@@ -21,7 +21,6 @@ from backend.numerics.order_rows import (
 )
 from backend.numerics.reasons import Reason
 from backend.numerics.sinusoid_rows import (
-    BLOCK,
     HALF,
     NAN,
     ONE,
@@ -218,11 +217,11 @@ def _locate_tile(
 
 
 @row_loop
-def _decode_block(
+def _decode_share(
+    counter: Any,
     addresses: Any,
     wide: Any,
     n_px: Any,
-    block: Any,
     steps: Any,
     coarse_px: Any,
     saturation: Any,
@@ -234,7 +233,8 @@ def _decode_block(
 ) -> None:
     rows = new_rows(steps.first_frame.size - 1)
     peaks = np.empty(TILE, np.uint16)
-    for start in range(block, min(block + BLOCK, n_px), TILE):
+    start = TILE * take_next(counter)
+    while start < n_px:
         n = min(TILE, n_px - start)
         variance = rows.single[11, :n]
         # The sum of all frequencies' means; `decode_frames` gets weights that make it the average.
@@ -266,10 +266,12 @@ def _decode_block(
             limits,
             maps,
         )
+        start = TILE * take_next(counter)
 
 
 @kernel
 def decode_frames(
+    work: Any,
     addresses: Any,
     wide: Any,
     n_px: Any,
@@ -283,12 +285,12 @@ def decode_frames(
     maps: Any,
 ) -> None:
     """Decode the frames of one exposure into maps, see `absolute_phase.decode_frames`."""
-    for block in numba.prange((n_px + BLOCK - 1) // BLOCK):
-        _decode_block(
+    for _ in numba.prange(work.n_threads):
+        _decode_share(
+            work.counter,
             addresses,
             wide,
             n_px,
-            block * BLOCK,
             steps,
             coarse_px,
             saturation,
@@ -301,13 +303,13 @@ def decode_frames(
 
 
 @row_loop
-def _locate_block(
+def _locate_share(
+    counter: Any,
     cosine: Any,
     sine: Any,
     mean: Any,
     sigma_gray: Any,
     known_reasons: Any,
-    block: Any,
     coarse_px: Any,
     orders: Any,
     scales: Any,
@@ -316,7 +318,8 @@ def _locate_block(
 ) -> None:
     n_px = known_reasons.size
     rows = new_rows(cosine.shape[0])
-    for start in range(block, min(block + BLOCK, n_px), TILE):
+    start = TILE * take_next(counter)
+    while start < n_px:
         n = min(TILE, n_px - start)
         end = start + n
         mean_row, variance = rows.single[10, :n], rows.single[11, :n]
@@ -339,10 +342,12 @@ def _locate_block(
             limits,
             maps,
         )
+        start = TILE * take_next(counter)
 
 
 @kernel
 def locate_phasors(
+    work: Any,
     cosine: Any,
     sine: Any,
     mean: Any,
@@ -355,14 +360,14 @@ def locate_phasors(
     maps: Any,
 ) -> None:
     """Turn phasors into maps, see `absolute_phase.absolute_phase`."""
-    for block in numba.prange((known_reasons.size + BLOCK - 1) // BLOCK):
-        _locate_block(
+    for _ in numba.prange(work.n_threads):
+        _locate_share(
+            work.counter,
             cosine,
             sine,
             mean,
             sigma_gray,
             known_reasons,
-            block * BLOCK,
             coarse_px,
             orders,
             scales,

@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from backend.numerics.kernels import kernel, narrow_part, row_loop, wide_part
+from backend.numerics.kernels import kernel, narrow_part, row_loop, take_next, wide_part
 from backend.numerics.reasons import Reason
 from backend.numerics.sinusoid_rows import (
-    BLOCK,
     NAN,
     TILE,
     ZERO,
@@ -139,11 +138,11 @@ def _store_fused(
 
 
 @row_loop
-def _fuse_block(
+def _fuse_share(
+    counter: Any,
     addresses: Any,
     wide: Any,
     n_px: Any,
-    block: Any,
     steps: Any,
     exposures: Any,
     wanted: Any,
@@ -157,7 +156,8 @@ def _fuse_block(
     peaks = np.empty(TILE, np.uint16)
     index_row, usable_row = np.empty(TILE, np.int32), np.empty(TILE, np.int32)
     single = rows.single
-    for start in range(block, min(block + BLOCK, n_px), TILE):
+    start = TILE * take_next(counter)
+    while start < n_px:
         n = min(TILE, n_px - start)
         end = start + n
         weight, total, best, best_ms = single[0, :n], single[1, :n], single[2, :n], single[3, :n]
@@ -244,10 +244,12 @@ def _fuse_block(
             fused.exposure_index[start:end],
             fused.reasons[start:end],
         )
+        start = TILE * take_next(counter)
 
 
 @kernel
 def fuse_exposures(
+    work: Any,
     addresses: Any,
     wide: Any,
     n_px: Any,
@@ -259,12 +261,12 @@ def fuse_exposures(
     fused: Any,
 ) -> None:
     """Fuse the frames of several exposures into phasors, see `phasors.fuse_exposures`."""
-    for block in numba.prange((n_px + BLOCK - 1) // BLOCK):
-        _fuse_block(
+    for _ in numba.prange(work.n_threads):
+        _fuse_share(
+            work.counter,
             addresses,
             wide,
             n_px,
-            block * BLOCK,
             steps,
             exposures,
             wanted,
@@ -290,11 +292,11 @@ def _store_rms(total: Any, inverse_freedom: Any, rms: Any) -> None:
 
 
 @row_loop
-def _misfit_block(
+def _misfit_share(
+    counter: Any,
     addresses: Any,
     wide: Any,
     n_px: Any,
-    block: Any,
     steps: Any,
     design: Any,
     inverse_freedom: Any,
@@ -303,7 +305,8 @@ def _misfit_block(
     rows = new_rows(steps.first_frame.size - 1)
     peaks = np.empty(TILE, np.uint16)
     total_row = rows.single[0]
-    for start in range(block, min(block + BLOCK, n_px), TILE):
+    start = TILE * take_next(counter)
+    while start < n_px:
         n = min(TILE, n_px - start)
         total = total_row[:n]
         demodulate(addresses, wide, start, n, steps, rows.cosine, rows.sine, rows.mean, peaks[:n])
@@ -319,12 +322,20 @@ def _misfit_block(
                     b = narrow_part(addresses[frame], start, n)
                     _add_square_misfit(b, in_phase, quadrature, c, q, m, total)
         _store_rms(total, inverse_freedom, rms[start : start + n])
+        start = TILE * take_next(counter)
 
 
 @kernel
 def sinusoid_misfit(
-    addresses: Any, wide: Any, n_px: Any, steps: Any, design: Any, inverse_freedom: Any, rms: Any
+    work: Any,
+    addresses: Any,
+    wide: Any,
+    n_px: Any,
+    steps: Any,
+    design: Any,
+    inverse_freedom: Any,
+    rms: Any,
 ) -> None:
     """Measure the rms distance of the frames from the sinusoids, see `phasors.sinusoid_misfit`."""
-    for block in numba.prange((n_px + BLOCK - 1) // BLOCK):
-        _misfit_block(addresses, wide, n_px, block * BLOCK, steps, design, inverse_freedom, rms)
+    for _ in numba.prange(work.n_threads):
+        _misfit_share(work.counter, addresses, wide, n_px, steps, design, inverse_freedom, rms)

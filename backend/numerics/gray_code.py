@@ -8,16 +8,25 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, Shaped, UInt16
 
 from backend.numerics.errors import CodeError, FrameError
-from backend.numerics.kernels import frame_stack, kernel, narrow_part, row_loop, wide_part
+from backend.numerics.kernels import (
+    frame_stack,
+    kernel,
+    narrow_part,
+    new_work,
+    row_loop,
+    take_next,
+    wide_part,
+)
 from backend.numerics.reasons import Reason
 
 _TILE = 2048
-_BLOCK = 8 * _TILE
 _INVERSE, _WHITE_BLACK, _FIXED = 0, 1, 2
 _CODE_MARGIN = np.int32(Reason.CODE_MARGIN)
 _OUTSIDE = np.int32(Reason.OUTSIDE_PROJECTOR)
 _SATURATED = np.int32(Reason.SATURATED)
 _0, _1 = np.int32(0), np.int32(1)
+_LARGEST = np.int32(0xFFFF)
+_MAX_BITS = 16
 
 
 class GrayCode(NamedTuple):
@@ -171,6 +180,8 @@ class _Reading(NamedTuple):
 
 
 def _reading(bits: int, codes: int, ignored_low_bits: int, unjudged_low_bits: int) -> _Reading:
+    if bits > _MAX_BITS:
+        raise CodeError(f"a code of {bits} bits is too long: give at most {_MAX_BITS} bits")
     if codes < 1 or codes > 2**bits:
         raise CodeError(
             f"{codes} codes don't fit into {bits} bits: give 1 to {2**bits} codes or the missing frames"
@@ -206,6 +217,7 @@ def _decode(
         reasons=np.empty(stack.shape, np.uint16),
     )
     _decode_gray(
+        new_work(),
         stack.addresses,
         stack.wide,
         result.code.size,
@@ -252,11 +264,11 @@ def _fill(row: Any, value: Any) -> None:
 def _read_bit(pattern: Any, inverse: Any, binary: Any, code: Any, contrast: Any) -> None:
     """Append one bit: Gray to binary is a running exclusive or from the coarsest bit on."""
     for i in range(code.size):
-        difference = np.int32(pattern[i]) - np.int32(inverse[i])
-        bit = binary[i] ^ (_1 if difference > _0 else _0)
+        p, q = np.uint16(pattern[i]), np.uint16(inverse[i])
+        bit = np.uint16(binary[i] ^ (np.uint16(1) if p > q else np.uint16(0)))
         binary[i] = bit
-        code[i] = (code[i] << _1) | bit
-        strength = abs(difference)
+        code[i] = np.uint16((code[i] << np.uint16(1)) | bit)
+        strength = np.uint16(p - q) if p > q else np.uint16(q - p)
         old = contrast[i]
         contrast[i] = strength if strength < old else old
 
@@ -266,18 +278,20 @@ def _read_bit_against(pattern: Any, reference: Any, binary: Any, code: Any, cont
     """Append one bit that is 1 where twice the gray level is more than the reference."""
     for i in range(code.size):
         difference = (np.int32(pattern[i]) << _1) - reference[i]
-        bit = binary[i] ^ (_1 if difference > _0 else _0)
+        bit = np.uint16(binary[i] ^ (np.uint16(1) if difference > _0 else np.uint16(0)))
         binary[i] = bit
-        code[i] = (code[i] << _1) | bit
-        strength = abs(difference)
-        old = contrast[i]
-        contrast[i] = strength if strength < old else old
+        code[i] = np.uint16((code[i] << np.uint16(1)) | bit)
+        strength = np.int32(abs(difference))
+        strength = strength if strength < _LARGEST else _LARGEST
+        old = np.int32(contrast[i])
+        contrast[i] = np.uint16(strength if strength < old else old)
 
 
 @row_loop
 def _keep_both_bright(pattern: Any, inverse: Any, brightest: Any) -> None:
     for i in range(brightest.size):
-        lower = np.int32(min(pattern[i], inverse[i]))
+        p, q = np.uint16(pattern[i]), np.uint16(inverse[i])
+        lower = p if p < q else q
         old = brightest[i]
         brightest[i] = lower if lower > old else old
 
@@ -304,16 +318,27 @@ def _store(
     pixels_per_code = np.float32(decision.pixels_per_code)
     half = np.float32(0.5 * (1 << decision.shift))
     for i in range(code.size):
-        first = code[i] << shift
-        reason = _CODE_MARGIN if contrast[i] <= min_contrast else _0
-        reason = reason | (_SATURATED if brightest[i] >= saturation else _0)
+        first = np.int32(code[i]) << shift
+        reason = _CODE_MARGIN if np.int32(contrast[i]) <= min_contrast else _0
+        reason = reason | (_SATURATED if np.int32(brightest[i]) >= saturation else _0)
         outside = _OUTSIDE if first >= codes else _0
         reason = reason if reason != _0 else outside
         code_out[i] = first if reason == _0 else np.int32(-1)
         middle = (np.float32(first) + half) * pixels_per_code - np.float32(0.5)
         projector_px[i] = middle if reason == _0 else np.float32(np.nan)
-        contrast_out[i] = np.uint16(contrast[i])
+        contrast_out[i] = contrast[i]
         reasons_out[i] = np.uint16(reason)
+
+
+class _Rows(NamedTuple):
+    """One thread's intermediate rows, one value per pixel of a tile."""
+
+    binary: Any  # uint16: the last bit of the code
+    code: Any  # uint16
+    contrast: Any  # uint16: of the weakest bit
+    unjudged: Any  # uint16: takes the contrast of bits that aren't judged
+    brightest: Any  # uint16: darker one of pattern and inverse, at its brightest
+    reference: Any  # int32: twice the gray level between black and white
 
 
 @row_loop
@@ -321,19 +346,19 @@ def _read_inverse(
     addresses: Any, wide: Any, start: Any, n: Any, bits: Any, decision: Any, rows: Any
 ) -> None:
     """Read all bits of one tile, each against its inverse."""
-    binary, code, brightest = rows[0, :n], rows[1, :n], rows[4, :n]
+    binary, code, brightest = rows.binary[:n], rows.code[:n], rows.brightest[:n]
     for bit in range(bits):
-        weakest = rows[2 if bit < decision.judged else 5, :n]
+        weakest = rows.contrast[:n] if bit < decision.judged else rows.unjudged[:n]
         first, second = addresses[bit], addresses[bits + bit]
         if wide:
             p, q = wide_part(first, start, n), wide_part(second, start, n)
             _read_bit(p, q, binary, code, weakest)
-            if decision.saturation <= 0xFFFF:
+            if decision.saturation <= _LARGEST:
                 _keep_both_bright(p, q, brightest)
         else:
             a, b = narrow_part(first, start, n), narrow_part(second, start, n)
             _read_bit(a, b, binary, code, weakest)
-            if decision.saturation <= 0xFFFF:
+            if decision.saturation <= _LARGEST:
                 _keep_both_bright(a, b, brightest)
 
 
@@ -341,8 +366,8 @@ def _read_inverse(
 def _read_against(
     addresses: Any, wide: Any, start: Any, n: Any, bits: Any, decision: Any, rows: Any
 ) -> None:
-    """Read all bits of one tile against a reference: the fields that follow the bits, or a threshold."""
-    binary, code, reference, brightest = rows[0, :n], rows[1, :n], rows[3, :n], rows[4, :n]
+    """Read all bits of one tile against the white and the black field, or a threshold."""
+    binary, code, reference = rows.binary[:n], rows.code[:n], rows.reference[:n]
     _fill(reference, np.int32(decision.double_threshold))
     for field in range(bits, addresses.size):
         if wide:
@@ -350,51 +375,67 @@ def _read_against(
         else:
             _add_to_reference(narrow_part(addresses[field], start, n), reference)
         if field == bits:
-            _add_to_reference(reference, brightest)
+            _keep_both_bright(reference, reference, rows.brightest[:n])
     for bit in range(bits):
-        weakest = rows[2 if bit < decision.judged else 5, :n]
+        weakest = rows.contrast[:n] if bit < decision.judged else rows.unjudged[:n]
         if wide:
-            _read_bit_against(wide_part(addresses[bit], start, n), reference, binary, code, weakest)
+            pattern = wide_part(addresses[bit], start, n)
+            _read_bit_against(pattern, reference, binary, code, weakest)
         else:
-            _read_bit_against(
-                narrow_part(addresses[bit], start, n), reference, binary, code, weakest
-            )
+            narrow = narrow_part(addresses[bit], start, n)
+            _read_bit_against(narrow, reference, binary, code, weakest)
 
 
 @row_loop
-def _decode_block(
-    addresses: Any, wide: Any, n_px: Any, block: Any, bits: Any, mode: Any, decision: Any, maps: Any
+def _decode_share(
+    counter: Any,
+    addresses: Any,
+    wide: Any,
+    n_px: Any,
+    bits: Any,
+    mode: Any,
+    decision: Any,
+    maps: Any,
 ) -> None:
-    rows = np.empty((6, _TILE), np.int32)
-    for start in range(block, min(block + _BLOCK, n_px), _TILE):
+    rows = _Rows(
+        np.empty(_TILE, np.uint16),
+        np.empty(_TILE, np.uint16),
+        np.empty(_TILE, np.uint16),
+        np.empty(_TILE, np.uint16),
+        np.empty(_TILE, np.uint16),
+        np.empty(_TILE, np.int32),
+    )
+    start = _TILE * take_next(counter)
+    while start < n_px:
         n = min(_TILE, n_px - start)
         end = start + n
-        code, contrast, brightest = rows[1, :n], rows[2, :n], rows[4, :n]
-        for row in range(6):
-            _fill(rows[row, :n], _0)
-        _fill(contrast, np.int32(0xFFFF))
+        _fill(rows.binary, 0)
+        _fill(rows.code, 0)
+        _fill(rows.contrast, 0xFFFF)
+        _fill(rows.brightest, 0)
         if mode == _INVERSE:
             _read_inverse(addresses, wide, start, n, bits, decision, rows)
         else:
             _read_against(addresses, wide, start, n, bits, decision, rows)
         _store(
-            code,
-            contrast,
-            brightest,
+            rows.code[:n],
+            rows.contrast[:n],
+            rows.brightest[:n],
             decision,
             maps.code[start:end],
             maps.projector_px[start:end],
             maps.contrast_gray[start:end],
             maps.reasons[start:end],
         )
+        start = _TILE * take_next(counter)
 
 
 @kernel
 def _decode_gray(
-    addresses: Any, wide: Any, n_px: int, bits: int, mode: int, decision: Any, maps: Any
+    work: Any, addresses: Any, wide: Any, n_px: Any, bits: Any, mode: Any, decision: Any, maps: Any
 ) -> None:
-    for block in numba.prange((n_px + _BLOCK - 1) // _BLOCK):
-        _decode_block(addresses, wide, n_px, block * _BLOCK, bits, mode, decision, maps)
+    for _ in numba.prange(work.n_threads):
+        _decode_share(work.counter, addresses, wide, n_px, bits, mode, decision, maps)
 
 
 class DistinctPixels(NamedTuple):

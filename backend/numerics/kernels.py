@@ -5,6 +5,7 @@ Importing this module imports numba (0.3 s), so only modules with kernels import
 
 import hashlib
 import inspect
+import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +24,11 @@ from backend.numerics.errors import FrameError
 # run parallel kernels at the same time; a station's server and its capture thread do that.
 _CONFIG: Any = numba.config
 _CONFIG.THREADING_LAYER = "omp"
+
+# OpenMP's threads spin for milliseconds before and after each kernel, waiting for one another. On a
+# station whose cores also capture, compress and serve, that multiplies a kernel's time by ten. It
+# has to be set before the layer is loaded, which the first kernel does; an operator's choice wins.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # Everything of `fastmath` but nnan and ninf: with those LLVM deletes the tests for NaN, which
 # means "invalid" in every map here.
@@ -99,6 +105,41 @@ def _pointer(typingctx, address):  # noqa: ANN001, ANN202
         return builder.inttoptr(arguments[0], cgutils.voidptr_t)
 
     return types.voidptr(types.uintp), codegen
+
+
+class Work(NamedTuple):
+    """The tiles that the threads of one call of a kernel share; `new_work` makes it."""
+
+    counter: Any  # int64[1]: the next tile
+    n_threads: int
+
+
+def new_work() -> Work:
+    """Prepare the sharing of one call's tiles between numba's threads.
+
+    In Python, as a kernel that asks numba for its number of threads can't be cached.
+    """
+    return Work(np.zeros(1, np.int64), int(numba.get_num_threads()))
+
+
+@no_type_check
+@intrinsic
+def take_next(typingctx, counter):  # noqa: ANN001, ANN201
+    """Take the next number from the counter of a `Work`.
+
+    numba gives each thread an equal share of a `prange`; when other programs keep one core busy the
+    rest waits for that core. Threads that take small tiles one by one finish together:
+
+        for _ in numba.prange(work.n_threads):
+            share(work.counter, n, ...)  # tile = take_next(counter); while tile < n: ...
+    """
+
+    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        one = context.get_constant(types.int64, 1)
+        return builder.atomic_rmw("add", array.data, one, "monotonic")
+
+    return types.int64(counter), codegen
 
 
 @no_type_check

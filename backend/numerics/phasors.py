@@ -1,6 +1,7 @@
 """Frames of known phase shifts, at one or several exposures, to one phasor per pixel and frequency."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Float32, Shaped, UInt8, UInt16
 from backend.numerics import fusion_kernels as kernels
 from backend.numerics.errors import FrameError
 from backend.numerics.fusion_kernels import NO_EXPOSURE
-from backend.numerics.kernels import FrameStack, frame_stack, kernel_input
+from backend.numerics.kernels import FrameStack, frame_stack, kernel_input, new_work
 from backend.numerics.sine_code import SineCode, step_fit
 from backend.numerics.sinusoid_rows import Steps
 from backend.numerics.uncertainty import NoiseModel
@@ -55,8 +56,9 @@ class Phasors(NamedTuple):
     """Why a pixel has no phasor, or no trustworthy one: bits of `Reason`."""
 
 
+@lru_cache(maxsize=64)
 def steps_of(code: SineCode) -> Steps:
-    """Put a code's weights where the kernels read them."""
+    """Put a code's weights where the kernels read them; nobody may write to them."""
     fits = [step_fit(shifts_rad) for shifts_rad in code.shifts_rad]
     counts = [len(shifts_rad) for shifts_rad in code.shifts_rad]
     weights = np.concatenate([fit.weights for fit in fits], axis=1)
@@ -152,6 +154,7 @@ def fuse_exposures(
         reasons=np.empty(shape, np.uint16),
     )
     kernels.fuse_exposures(
+        new_work(),
         stack.addresses,
         stack.wide,
         shape[0] * shape[1],
@@ -278,6 +281,7 @@ def sinusoid_misfit(
     shifts = np.concatenate([np.asarray(shifts_rad) for shifts_rad in code.shifts_rad])
     misfit_gray = np.empty(stack.shape, np.float32)
     kernels.sinusoid_misfit(
+        new_work(),
         stack.addresses,
         stack.wide,
         misfit_gray.size,

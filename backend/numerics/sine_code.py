@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -77,7 +78,12 @@ class SineCode:
     @property
     def noise_gains(self) -> tuple[float, ...]:
         """Variance of the phase over (sigma_I / B)^2, one value per frequency: 2/N for even steps."""
-        return tuple(step_fit(shifts_rad).noise_gain for shifts_rad in self.shifts_rad)
+        return _noise_gains(self.shifts_rad)
+
+
+@lru_cache(maxsize=64)
+def _noise_gains(shifts_rad: tuple[tuple[float, ...], ...]) -> tuple[float, ...]:
+    return tuple(step_fit(of_one).noise_gain for of_one in shifts_rad)
 
 
 class StepFit(NamedTuple):

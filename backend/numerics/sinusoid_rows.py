@@ -11,10 +11,9 @@ import numpy as np
 from backend.numerics.kernels import narrow_part, row_loop, wide_part
 
 TILE = 2048
-"""Pixels per tile; some 30 rows of them stay in the second-level cache."""
+"""Pixels per tile; some 30 rows of them stay in the second-level cache.
 
-BLOCK = 8 * TILE
-"""Pixels per task of a thread; its rows are allocated once per task."""
+Threads take tile after tile, see `take_next`."""
 
 # Numbers in a kernel have to be float32 one by one: a Python float makes the whole loop float64.
 ZERO = np.float32(0.0)
@@ -147,6 +146,45 @@ def _add_four(
 
 
 @row_loop
+def _set_four(
+    frame_0: Any,
+    frame_1: Any,
+    frame_2: Any,
+    frame_3: Any,
+    weights: Any,
+    first: Any,
+    cosine: Any,
+    sine: Any,
+    mean: Any,
+) -> None:
+    """Start sums with four frames: half the memory traffic of clearing and adding."""
+    c0, c1, c2, c3 = (
+        weights[0, first],
+        weights[0, first + 1],
+        weights[0, first + 2],
+        weights[0, first + 3],
+    )
+    s0, s1, s2, s3 = (
+        weights[1, first],
+        weights[1, first + 1],
+        weights[1, first + 2],
+        weights[1, first + 3],
+    )
+    m0, m1, m2, m3 = (
+        weights[2, first],
+        weights[2, first + 1],
+        weights[2, first + 2],
+        weights[2, first + 3],
+    )
+    for i in range(frame_0.size):
+        g0, g1 = np.float32(frame_0[i]), np.float32(frame_1[i])
+        g2, g3 = np.float32(frame_2[i]), np.float32(frame_3[i])
+        cosine[i] = c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
+        sine[i] = s0 * g0 + s1 * g1 + s2 * g2 + s3 * g3
+        mean[i] += m0 * g0 + m1 * g1 + m2 * g2 + m3 * g3
+
+
+@row_loop
 def _keep_peak(frame: Any, peak: Any) -> None:
     for i in range(frame.size):
         gray = np.uint16(frame[i])
@@ -175,6 +213,7 @@ def count_saturated(frame: Any, saturation: Any, count: Any) -> None:
 @row_loop
 def _add_four_frames(
     addresses: Any,
+    started: Any,
     wide: Any,
     start: Any,
     n: Any,
@@ -190,12 +229,18 @@ def _add_four_frames(
     if wide:
         p, q = wide_part(first, start, n), wide_part(second, start, n)
         r, s = wide_part(third, start, n), wide_part(fourth, start, n)
-        _add_four(p, q, r, s, weights, frame, cosine, sine, mean)
+        if started:
+            _add_four(p, q, r, s, weights, frame, cosine, sine, mean)
+        else:
+            _set_four(p, q, r, s, weights, frame, cosine, sine, mean)
         _keep_peak_of_four(p, q, r, s, peak)
     else:
         a, b = narrow_part(first, start, n), narrow_part(second, start, n)
         c, d = narrow_part(third, start, n), narrow_part(fourth, start, n)
-        _add_four(a, b, c, d, weights, frame, cosine, sine, mean)
+        if started:
+            _add_four(a, b, c, d, weights, frame, cosine, sine, mean)
+        else:
+            _set_four(a, b, c, d, weights, frame, cosine, sine, mean)
         _keep_peak_of_four(a, b, c, d, peak)
 
 
@@ -221,12 +266,24 @@ def demodulate(
         fill(mean[k, :n], ZERO)
     for k in range(cosine.shape[0]):
         cosine_k, sine_k, mean_k = cosine[k, :n], sine[k, :n], mean[k % mean.shape[0], :n]
-        fill(cosine_k, ZERO)
-        fill(sine_k, ZERO)
-        frame, end = steps.first_frame[k], steps.first_frame[k + 1]
+        start_frame, end = steps.first_frame[k], steps.first_frame[k + 1]
+        frame = start_frame
+        if end - start_frame < 4:
+            fill(cosine_k, ZERO)
+            fill(sine_k, ZERO)
         while frame + 4 <= end:
             _add_four_frames(
-                addresses, wide, start, n, weights, frame, cosine_k, sine_k, mean_k, peak
+                addresses,
+                frame > start_frame,
+                wide,
+                start,
+                n,
+                weights,
+                frame,
+                cosine_k,
+                sine_k,
+                mean_k,
+                peak,
             )
             frame += 4
         while frame < end:

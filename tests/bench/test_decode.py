@@ -143,7 +143,8 @@ def test_fusing_three_exposures_and_finding_the_position(benchmark):
     # Nine float maps are written, twice as much as is read, into memory that is new each time.
     assert times["fuse"] <= 16 * times["copy"]
     assert times["fuse"] * 3 <= times["numpy"]
-    assert times["locate"] <= 4 * times["copy"]
+    # Ten float maps are read, more than all the frames.
+    assert times["locate"] <= 6 * times["copy"]
 
 
 def test_gray_code_of_44_frames_takes_at_most_three_copies(benchmark):

@@ -138,11 +138,26 @@ def test_references_work_per_pixel_and_a_threshold_does_not():
     [
         ({"codes": 17}, CodeError, "17 codes don't fit into 4 bits"),
         ({"codes": 0}, CodeError, "0 codes"),
+        (
+            {
+                "patterns": [np.zeros((2, 3), np.uint8)] * 17,
+                "inverses": [np.zeros((2, 3), np.uint8)] * 17,
+            },
+            CodeError,
+            "at most 16 bits",
+        ),
         ({"ignored_low_bits": 4}, CodeError, "leaves none to read"),
         ({"ignored_low_bits": 1, "unjudged_low_bits": 3}, CodeError, "leaves none to judge"),
         ({"inverses": [np.zeros((2, 3), np.uint8)] * 3}, FrameError, "4 patterns but 3 inverses"),
     ],
-    ids=["too-many-codes", "no-codes", "no-bits", "no-judged-bits", "inverse-missing"],
+    ids=[
+        "too-many-codes",
+        "no-codes",
+        "too-many-bits",
+        "no-bits",
+        "no-judged-bits",
+        "inverse-missing",
+    ],
 )
 def test_codes_that_do_not_fit_are_refused(change, error, message):
     arguments = {
