@@ -39,7 +39,8 @@ class Runner(Protocol):
 @dataclass(frozen=True)
 class _Started:
     execution: JobExecution
-    thread: threading.Thread
+    ended: threading.Event
+    """Waited for instead of the thread: a `join` that Ctrl-C interrupts takes a living thread for dead (Python < 3.13)."""
 
 
 class JobThreads:
@@ -53,6 +54,7 @@ class JobThreads:
 
     def start(self, job: JobRow) -> None:  # noqa: D102 (see Runner)
         execution = JobExecution(job, self._shop, self._compute)
+        ended = threading.Event()
 
         def run() -> None:
             try:
@@ -60,10 +62,11 @@ class JobThreads:
             finally:
                 with self._lock:
                     self._started.pop(job.id, None)
+                ended.set()
 
         thread = threading.Thread(target=run, name=f"job-{job.id}", daemon=True)
         with self._lock:
-            self._started[job.id] = _Started(execution, thread)
+            self._started[job.id] = _Started(execution, ended)
         thread.start()
 
     def cancel(self, job: str, who: str) -> bool:  # noqa: D102 (see Runner)
@@ -78,15 +81,12 @@ class JobThreads:
 
     def wait(self, job: str, timeout_s: float | None = None) -> bool:  # noqa: D102 (see Runner)
         started = self._started.get(job)
-        if started is None:
-            return True
-        started.thread.join(timeout_s)
-        return not started.thread.is_alive()
+        return started is None or started.ended.wait(timeout_s)
 
     def close(self) -> None:  # noqa: D102 (see Runner)
         for started in list(self._started.values()):
             started.execution.control.stop(None)
-            started.thread.join()
+            started.ended.wait()
 
 
 class LocalRunner(JobThreads):

@@ -55,6 +55,16 @@ def test_both_runners_make_the_same_results(
     assert None not in found[0]
 
 
+def test_a_scan_runs_on_every_database(database: Database, store: LocalArtifactStore) -> None:
+    with inline_house(database, store) as house:
+        state = house.run_through(house.create().id)
+        state = house.undo(house.edit(house.redo(state, "toy_fringes"), "toy_levels", step_gray=32))
+        state = house.run_through(state.id)
+        assert set(statuses(state).values()) == {"done", "accepted"}
+        assert house.services.scans()[0].status == "done"
+        assert house.services.statistics().frames == 2 * (4 + 8 + 8)
+
+
 SENTENCES = [
     ("numerics", "frequency 0 has no phase: give one above 0", False),
     ("sentence", "The picture is black: open the iris.", False),
