@@ -2,6 +2,7 @@
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -249,3 +250,9 @@ def test_a_real_time_rig_takes_the_exposures_time(opened):
     start = time.monotonic()
     shoot(rig, exposure_ms=50.0)
     assert time.monotonic() - start >= 0.05
+
+
+def test_cameras_that_expose_at_once_wait_for_the_one_world() -> None:
+    with create_rig(SMALL | {"seed": 12345}) as rig, ThreadPoolExecutor(2) as threads:
+        pictures = threads.map(lambda name: shoot(rig, camera=name), rig.cameras)
+        assert all(frame.data.max() > 20 for frame in pictures)

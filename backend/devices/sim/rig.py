@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from threading import Lock
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
@@ -67,6 +68,7 @@ class SimulatedRig:
         self._sensors = {
             name: _sensor(config, index) for index, name in enumerate(self._layout.cameras)
         }
+        self._loading = Lock()
         self._world: World | None = None
         self._beam: Beam | None = None
         self._paths: dict[str, LightPaths] = {}
@@ -156,11 +158,13 @@ class SimulatedRig:
         return self._load().truth(reference, tuple(cameras or self._cameras))
 
     def _load(self) -> World:
-        if self._world is None:
-            self._world = world(self.config)
-            self._paths, softest = light_paths(self._world.transports, self.config)
-            self._beam = Beam(self.config, softest)
-        return self._world
+        with self._loading:  # both cameras expose at once, each in its own thread
+            if self._world is None:
+                loaded = world(self.config)
+                self._paths, softest = light_paths(loaded.transports, self.config)
+                self._beam = Beam(self.config, softest)
+                self._world = loaded
+            return self._world
 
     def _develop(
         self, camera: str, exposure: Exposure
