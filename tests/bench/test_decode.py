@@ -44,7 +44,7 @@ def copier(frames: list[np.ndarray]) -> Callable[[], None]:
     return copy
 
 
-def best_ms(candidates: dict[str, Callable[[], object]], rounds: int = 15) -> dict[str, float]:
+def best_ms(candidates: dict[str, Callable[[], object]], rounds: int = 40) -> dict[str, float]:
     """Best time of each candidate; they take turns, so that a busy moment meets all of them."""
     best = dict.fromkeys(candidates, float("inf"))
     for candidate in candidates.values():
@@ -137,7 +137,7 @@ def test_fusing_three_exposures_and_finding_the_position(benchmark):
         return absolute_phase(phasors, CODE, orders, size_px=SIZE_PX, limits=Limits(), out=maps)
 
     everything = [frame for frames in exposures for frame in frames]
-    times = best_ms({"copy": copier(everything), "fuse": fuse, "locate": locate}, rounds=9)
+    times = best_ms({"copy": copier(everything), "fuse": fuse, "locate": locate}, rounds=20)
     times["numpy"] = best_ms({"numpy": fuse_numpy}, rounds=2)["numpy"]
     report(benchmark, times, fuse)
     # Nine float maps are written, twice as much as is read, into memory that is new each time.
@@ -188,7 +188,7 @@ def test_gray_code_of_44_frames_takes_at_most_three_copies(benchmark):
         return codes
 
     everything = [frame for pair in sets.values() for part in pair for frame in part]
-    times = best_ms({"copy": copier(everything), "decode": decode}, rounds=9)
+    times = best_ms({"copy": copier(everything), "decode": decode}, rounds=20)
     times["numpy"] = best_ms({"numpy": decode_numpy}, rounds=2)["numpy"]
     report(benchmark, times, decode)
     found = decode()
