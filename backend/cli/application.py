@@ -31,7 +31,7 @@ for group in (serving, scanning, captures, describing, checking, comparing, benc
     group.register(application)
 
 
-def _version(wanted: bool) -> None:
+def _version(wanted: bool | None) -> None:
     if wanted:
         from importlib.metadata import version
 
@@ -42,8 +42,9 @@ def _version(wanted: bool) -> None:
 @application.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
-    ] = False,
+        bool | None,  # None: what typer passes on when the option has had its callback
+        typer.Option("--version", callback=_version, is_eager=True, help="Show the version."),
+    ] = None,
 ) -> None:
     """Take the options that all commands have."""
 

@@ -8,7 +8,14 @@ import typer
 from backend.cli.house import open_services, who
 from backend.cli.options import AsJson, DataFolder, Quiet, Settings, parse_settings
 from backend.cli.output import Document, ProgressLines, answering, console, quiet_logging, table
-from backend.cli.scanning import Out, WithFrames, describe_scan, run_and_export, show_summary
+from backend.cli.scanning import (
+    Out,
+    WithFrames,
+    describe_scan,
+    refuse_place,
+    run_and_export,
+    show_summary,
+)
 
 if TYPE_CHECKING:
     from backend.services.replaying import Replay
@@ -42,6 +49,7 @@ def import_capture(
     with answering(as_json) as answer, ProgressLines(hidden=quiet) as progress:
         changes = parse_settings(settings)
         with open_services(data, progress) as services:
+            refuse_place(services, out)
             state = services.import_capture(str(capture), name, who(), progress.part("import"))
             answer.update(describe_scan(state))
             _apply(services, state.id, changes)

@@ -21,6 +21,7 @@ from backend.cli.options import (
     parse_settings,
 )
 from backend.cli.output import ProgressLines, answering, console, quiet_logging, table
+from backend.cli.scanning import truth_words
 
 if TYPE_CHECKING:
     from backend.services.comparing import Compared
@@ -78,46 +79,36 @@ def compare(
 
 def _show(results: "Sequence[Compared]") -> None:
     from backend.numerics.scoring import DEFINITION
-    from backend.services.comparing import table_row
+    from backend.services.comparing import part_figures, table_row
 
     out = console()
     rows = table(
-        "strategy",
-        ">complete",
-        ">outliers",
-        ">rms",
-        ">median",
-        ">points",
-        ">light",
-        ">in all",
-        "exposures",
-    )
+        "strategy", ">complete", ">outliers", ">rms mm", ">median mm", ">points", ">light s", ">in all s",
+        "exposures ms",
+    )  # fmt: skip
     for result in results:
         row = table_row(result)
         rows.add_row(
             row["strategy"],
             _words(row, "completeness", ".2%"),
             _words(row, "outlier_share", ".3%"),
-            _words(row, "rms_mm", ".4f", " mm"),
-            _words(row, "median_mm", ".4f", " mm"),
+            _words(row, "rms_mm", ".4f"),
+            _words(row, "median_mm", ".4f"),
             _words(row, "points", "d"),
-            _words(row, "light_s", ".2f", " s"),
-            _words(row, "total_s", ".2f", " s"),
-            result.error or ", ".join(f"{t:.1f}" for t in result.exposures_ms) + " ms",
+            _words(row, "light_s", ".2f"),
+            _words(row, "total_s", ".2f"),
+            result.error or ", ".join(f"{t:.1f}" for t in result.exposures_ms),
         )
     out.print(rows)
     for result in results:
-        for part, figures in (result.scores.parts if result.scores else {}).items():
-            out.print(
-                f"  {result.strategy.name}, {part}: {figures.completeness:.2%} complete, "
-                f"{figures.outlier_share:.3%} outliers, rms {figures.rms_mm:.4f} mm"
-            )
+        for part, figures in part_figures(result).items():
+            out.print(f"  {result.strategy.name}, {part}: {truth_words(figures)}")
     out.print(DEFINITION)
 
 
-def _words(row: Mapping[str, Any], name: str, form: str, unit: str = "") -> str:
+def _words(row: Mapping[str, Any], name: str, form: str) -> str:
     value = row[name]
-    return "" if value is None else f"{value:{form}}{unit}"
+    return "" if value is None else f"{value:{form}}"
 
 
 def noise(

@@ -22,6 +22,7 @@ Document = dict[str, Any]
 FAILED = 1
 CANCELLED = 130
 """As a shell reports a program that Ctrl+C ended."""
+_WIDTH_OF_FILES = 140
 
 
 @contextlib.contextmanager
@@ -57,10 +58,12 @@ def complain(sentence: str) -> None:
 
 
 def console(*, errors: bool = False) -> "Console":
-    """Return where texts and tables go."""
+    """Return where texts and tables go; a file or pipe gets wide ones."""
     from rich.console import Console
 
-    return Console(stderr=errors, soft_wrap=True, highlight=False)
+    is_terminal = (sys.stderr if errors else sys.stdout).isatty()
+    width = None if is_terminal else _WIDTH_OF_FILES
+    return Console(stderr=errors, soft_wrap=True, highlight=False, width=width)
 
 
 def table(*columns: str, title: str | None = None) -> "Table":

@@ -73,11 +73,18 @@ def scan(
             settings=parse_settings(settings),
         )
         with open_services(data, progress) as services:
+            refuse_place(services, out)
             progress.step("rig", 0.0, "opening")
             chosen = resume or services.create_scan(request, who()).id
             run_and_export(services, chosen, answer, progress, out=out, frames=frames)
     if not as_json:
         show_summary(answer)
+
+
+def refuse_place(services: "Services", out: Path | None) -> None:
+    """Refuse a folder that an export couldn't go to now, not after minutes of capturing."""
+    if out is not None:
+        services.refuse_export(str(out))
 
 
 def run_and_export(
@@ -93,8 +100,6 @@ def run_and_export(
     from backend.contract.requests import StartRun
 
     answer.update({"scan": scan_id, "status": "running"})
-    if out is not None:
-        services.refuse_export(str(out))  # not after minutes of capturing
     try:
         services.run(scan_id, StartRun(unattended=True), who())
     finally:

@@ -3,9 +3,9 @@
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from backend.domain.errors import UnglareError
 from backend.domain.frames import Frame
 from backend.domain.shots import Progress
 from backend.jobs.loading import LoadedScan, load_scan
-from backend.numerics.scoring import Score, Scores
+from backend.numerics.scoring import Scores
 from backend.services import editing, running, scans
 from backend.services.context import Context
 from backend.services.export_folder import FolderKind, refuse_foreign, whole_folder
@@ -37,7 +37,7 @@ _CAPTION_PX = 22
 _INK = (230, 230, 230)
 _PAPER = (30, 25, 22)
 
-Picture = UInt8[np.ndarray, "h w 3"]
+Picture = UInt8[np.ndarray, "_h _w 3"]
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,20 @@ STRATEGIES = (
 )
 
 
+class Panel(NamedTuple):
+    """One picture of a contact sheet."""
+
+    caption: str
+    picture: Picture
+
+
+class Scale(NamedTuple):
+    """Values at both ends of the colours: those of the first strategy, so that rows can be compared."""
+
+    columns_px: tuple[float, float]
+    depth_mm: tuple[float, float]
+
+
 @dataclass(frozen=True)
 class Compared:
     """What one strategy reached."""
@@ -90,8 +104,10 @@ class Compared:
     """Light of the preview's and of all fringes, plus the time of computing."""
     points: int | None = None
     scores: Scores | None = None
-    panels: Mapping[str, Picture] = field(default_factory=dict)
-    """Pictures of the reference camera by caption."""
+    panels: tuple["Panel", ...] = ()
+    """Pictures of the reference camera."""
+    scale: "Scale | None" = None
+    """What the colours of its pictures mean."""
 
 
 def compare(
@@ -146,7 +162,8 @@ def _measure(
         return Compared(strategy, error.sentence)
     if state.job and state.job.error:
         return Compared(strategy, state.job.error)
-    return _collect(context, scan, strategy)
+    scale = next((c.scale for c in earlier.values() if c.scale), None)
+    return _collect(context, scan, strategy, scale)
 
 
 def _choose(context: Context, scan: str, strategy: Strategy, budget_s: float | None) -> None:
@@ -174,7 +191,7 @@ def _revision(context: Context, scan: str) -> int:
         return repositories.scans.get(scan).revision
 
 
-def _collect(context: Context, scan: str, strategy: Strategy) -> Compared:
+def _collect(context: Context, scan: str, strategy: Strategy, scale: Scale | None) -> Compared:
     figures = report(context, scan)
     with context.database.reading() as repositories:
         loaded = load_scan(repositories, context.registry, scan)
@@ -187,6 +204,7 @@ def _collect(context: Context, scan: str, strategy: Strategy) -> Compared:
         fringes: FringeFrames = result(FringeFrames)
         phase: AbsolutePhase = result(AbsolutePhase)
         cloud: Cloud = result(Cloud)
+    scale = scale or _scale(phase, cloud)
     return Compared(
         strategy=strategy,
         exposures_ms=exposures.exposures_ms,
@@ -194,7 +212,8 @@ def _collect(context: Context, scan: str, strategy: Strategy) -> Compared:
         total_s=fringes.exposure_time_s + _computing_s(loaded),
         points=figures.points,
         scores=figures.scores,
-        panels=_panels(preview, fringes, phase, cloud),
+        panels=_panels(preview, fringes, phase, cloud, scale),
+        scale=scale,
     )
 
 
@@ -213,46 +232,55 @@ def _computing_s(loaded: LoadedScan) -> float:
 # pictures
 
 
+def _scale(phase: AbsolutePhase, cloud: Cloud) -> Scale:
+    name = next(iter(cloud.depth_mm))
+    columns, depths = phase.projector_px[name], cloud.depth_mm[name]
+    limits = [np.nanpercentile(values, [1, 99]).tolist() for values in (columns, depths)]
+    return Scale(tuple(limits[0]), tuple(limits[1]))
+
+
 def _panels(
-    preview: Preview, fringes: FringeFrames, phase: AbsolutePhase, cloud: Cloud
-) -> dict[str, Picture]:
+    preview: Preview, fringes: FringeFrames, phase: AbsolutePhase, cloud: Cloud, scale: Scale
+) -> tuple[Panel, ...]:
     """Draw the reference camera's pictures as the paper shows them."""
     name = next(iter(cloud.depth_mm))
     frames = [f for f in fringes.frames if f.camera == name]
     shortest, longest = (extreme(frames, key=_exposure_ms) for extreme in (min, max))
-    return {
-        f"white field, {preview.t_pre_ms:.1f} ms": _picture(preview.white[name]),
-        f"fringe, {_exposure_ms(shortest):.1f} ms": _picture(shortest.gray),
-        f"fringe, {_exposure_ms(longest):.1f} ms": _picture(longest.gray),
-        "wrapped phase": _picture(
-            phase.wrapped_rad[name], colormap="twilight", low=-np.pi, high=np.pi
-        ),
-        "absolute phase": _picture(phase.projector_px[name], colormap="turbo"),
-        "depth of the points": _picture(cloud.depth_mm[name], colormap="turbo"),
-    }
+    wrapped = _picture(phase.wrapped_rad[name], "twilight", (-np.pi, np.pi))
+    return (
+        Panel(f"white field, {preview.t_pre_ms:.1f} ms", _picture(preview.white[name])),
+        Panel(f"shortest exposure, {_exposure_ms(shortest):.1f} ms", _picture(shortest.gray)),
+        Panel(f"longest exposure, {_exposure_ms(longest):.1f} ms", _picture(longest.gray)),
+        Panel("wrapped phase", wrapped),
+        Panel("absolute phase", _picture(phase.projector_px[name], "turbo", scale.columns_px)),
+        Panel("depth of the points", _picture(cloud.depth_mm[name], "turbo", scale.depth_mm)),
+    )
 
 
 def _exposure_ms(frame: Frame) -> float:
     return frame.exposure_ms or 0.0
 
 
-def _picture(values: np.ndarray[Any, np.dtype[Any]], **options: Any) -> Picture:
-    drawn = draw(np.asarray(values), max_px=_PANEL_PX, format="jpeg", **options)
+def _picture(
+    values: np.ndarray[Any, np.dtype[Any]],
+    colormap: str = "gray",
+    limits: tuple[float | None, float | None] = (None, None),
+) -> Picture:
+    low, high = limits
+    drawn = draw(
+        np.asarray(values), max_px=_PANEL_PX, colormap=colormap, low=low, high=high, format="jpeg"
+    )
     return np.asarray(cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR), np.uint8)
 
 
 def contact_sheet(results: Sequence[Compared]) -> Picture:
     """Put the panels of one or several strategies side by side, a row for each."""
     rows = [_row(result) for result in results if result.panels]
-    if not rows:
-        return np.full((_CAPTION_PX, _PANEL_PX, 3), _PAPER, np.uint8)
-    width = max(row.shape[1] for row in rows)
-    return np.vstack([_padded(row, width) for row in rows])
+    return np.vstack(rows) if rows else _line("no strategy has a cloud", _PANEL_PX)
 
 
 def _row(result: Compared) -> Picture:
-    panels = [_captioned(caption, panel) for caption, panel in result.panels.items()]
-    pictures = np.hstack(panels)
+    pictures = np.hstack([_captioned(*panel) for panel in result.panels])
     return np.vstack([_line(headline(result), pictures.shape[1]), pictures])
 
 
@@ -281,36 +309,18 @@ def _line(text: str, width_px: int) -> Picture:
     return line
 
 
-def _padded(row: Picture, width_px: int) -> Picture:
-    missing = width_px - row.shape[1]
-    return np.pad(row, ((0, 0), (0, missing), (0, 0))) if missing else row
-
-
 # tables and files
 
-COLUMNS = (
-    "strategy",
-    "completeness",
-    "outlier_share",
-    "rms_mm",
-    "median_mm",
-    "points",
-    "light_s",
-    "total_s",
-    "exposures_ms",
-    "error",
-)
+FIGURES = ("completeness", "outlier_share", "rms_mm", "median_mm")
+COLUMNS = ("strategy", *FIGURES, "points", "light_s", "total_s", "exposures_ms", "error")
 
 
 def table_row(result: Compared) -> dict[str, Any]:
     """Return one strategy's figures by column; what it didn't reach is None."""
-    total: Score | None = result.scores.total if result.scores else None
+    figures = truth_document(result.scores).get("truth", {})
     return {
         "strategy": result.strategy.name,
-        "completeness": total.completeness if total else None,
-        "outlier_share": total.outlier_share if total else None,
-        "rms_mm": total.rms_mm if total else None,
-        "median_mm": total.median_mm if total else None,
+        **{name: figures.get(name) for name in FIGURES},
         "points": result.points,
         "light_s": result.light_s,
         "total_s": result.total_s,
@@ -319,9 +329,9 @@ def table_row(result: Compared) -> dict[str, Any]:
     }
 
 
-def part_rows(result: Compared) -> dict[str, Score]:
-    """Return the figures of each part of the scene."""
-    return dict(result.scores.parts) if result.scores else {}
+def part_figures(result: Compared) -> dict[str, dict[str, Any]]:
+    """Return the figures of each part of the scene; what can't be said is None."""
+    return dict(truth_document(result.scores).get("parts", {}))
 
 
 def write_comparison(folder: Path, results: Sequence[Compared]) -> tuple[Path, ...]:
@@ -370,9 +380,9 @@ def _csv(results: Sequence[Compared]) -> str:
         row = table_row(result)
         row["exposures_ms"] = " ".join(f"{t:.4g}" for t in result.exposures_ms)
         writer.writerow([row["strategy"], "all", *(row[name] for name in COLUMNS[1:])])
-        for part, figures in part_rows(result).items():
-            known = [getattr(figures, name) for name in COLUMNS[1:5]]
-            writer.writerow([row["strategy"], part, *known, figures.accepted])
+        for part, figures in part_figures(result).items():
+            known = [figures[name] for name in (*FIGURES, "accepted")]
+            writer.writerow([row["strategy"], part, *known])
     return text.getvalue()
 
 

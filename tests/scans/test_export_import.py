@@ -169,7 +169,8 @@ def test_a_replay_names_the_stages_that_differ(house, scan, tmp_path):
     folder = export(house, scan, tmp_path / "out")
     picture = folder / "frames/toy_fringes/left/0003.png"
     gray = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
-    cv2.imwrite(str(picture), gray // 2)
+    assert gray is not None
+    cv2.imwrite(str(picture), (gray // 2).astype(np.uint8))
     replay = house.services.replay_folder(str(folder))
     assert not replay.is_same
     verdicts = {s.name: s.verdict for s in replay.stages}
@@ -274,8 +275,8 @@ def test_an_empty_folder_is_used(house, scan, tmp_path):
 @pytest.mark.parametrize(
     ("prepare", "words"),
     [
-        (lambda folder: (folder / "notes.txt").write_text("mine"), "isn't empty"),
-        (lambda folder: (folder / "scan.json").write_text("{}"), "isn't empty"),
+        (lambda folder: (folder / "notes.txt").write_text("mine"), "isn.t empty"),
+        (lambda folder: (folder / "scan.json").write_text("{}"), "isn.t empty"),
     ],
 )
 def test_a_folder_with_other_things_is_refused(house, scan, tmp_path, prepare, words):

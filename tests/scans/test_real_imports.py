@@ -32,11 +32,13 @@ def test_the_shell_becomes_the_authors_cloud(tmp_path):
         state = run_unattended(services, imported.id)
         assert [s.status for s in state.stages] == [StageStatus.DONE, StageStatus.DONE]
         run = stage_of(state, "code_cloud").stage_run
+        assert run is not None
         with services.context.database.reading() as repositories:
             document = repositories.runs.get(run).document
+        assert document is not None
         cloud = decode(document, Cloud, services.context.store)
         file = real("gray-inverse-procam-shell/reference/upstream_cloud.ply")
-        reference = np.asarray(o3d.io.read_point_cloud(str(file)).points) * [1, -1, -1]
+        reference = np.asarray(o3d.io.read_point_cloud(file).points) * [1, -1, -1]
         distance = cKDTree(cloud.points_mm).query(reference)[0]
     assert cloud.point_count >= 290_000
     assert np.median(distance) <= 0.2

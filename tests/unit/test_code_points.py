@@ -22,7 +22,8 @@ def positions(points):
 
 
 def test_points_come_back_where_they_were(truth):
-    result = triangulate_code(*positions(truth), *procam.devices())
+    camera_px, projector_px = positions(truth)
+    result = triangulate_code(camera_px, projector_px, *procam.devices())
     np.testing.assert_allclose(result.points_mm, truth, atol=1e-6)
     np.testing.assert_allclose(result.row_residual_px, 0, atol=1e-8)
 
@@ -52,6 +53,7 @@ def test_rays_that_do_not_meet_in_front_have_no_point():
 
 def test_a_singular_camera_is_refused(truth):
     camera, projector, pose = procam.devices()
+    camera_px, projector_px = positions(truth)
     broken = camera._replace(K=np.zeros((3, 3)))
     with pytest.raises(CalibrationError, match="focal lengths"):
-        triangulate_code(*positions(truth), broken, projector, pose)
+        triangulate_code(camera_px, projector_px, broken, projector, pose)

@@ -56,7 +56,7 @@ def test_our_reader_gets_back_every_bit(written):
 
 def test_open3d_reads_points_normals_and_colours(written):
     cloud, path = written
-    found = o3d.io.read_point_cloud(str(path))
+    found = o3d.io.read_point_cloud(path)
     np.testing.assert_array_equal(np.asarray(found.points), cloud.points_mm)
     np.testing.assert_allclose(np.asarray(found.normals), cloud.normals, atol=1e-7)
     np.testing.assert_allclose(np.asarray(found.colors) * 255, cloud.colour, atol=1e-6)
@@ -64,7 +64,7 @@ def test_open3d_reads_points_normals_and_colours(written):
 
 def test_open3d_reads_the_scalars_too(written):
     cloud, path = written
-    found = o3d.t.io.read_point_cloud(str(path)).point
+    found = o3d.t.io.read_point_cloud(path).point
     for name in ("sigma_mm", "pixel_x", "pixel_y", "exposure_index"):
         np.testing.assert_array_equal(found[name].numpy().ravel(), getattr(cloud, name))
 

@@ -1,0 +1,91 @@
+"""What stands behind --set, --rig-option and the sizes."""
+
+import subprocess
+import sys
+
+import pytest
+
+from backend.cli.options import parse_rig_options, parse_settings, parse_value
+from backend.domain.errors import InvalidSettingError
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("3", 3),
+        ("2.5", 2.5),
+        ("-1e-3", -1e-3),
+        ("null", None),
+        ("true", True),
+        ("[1, 2]", [1, 2]),
+        ("16.7,100", [16.7, 100]),
+        ('"3"', "3"),
+        ("fast", "fast"),
+        ("sprayed:metal", "sprayed:metal"),
+        ("a,b", "a,b"),
+        ("NaN", "NaN"),
+        ("Infinity", "Infinity"),
+        ("", ""),
+    ],
+)
+def test_a_value_is_json_a_list_or_text(text, value):
+    assert parse_value(text) == value
+    assert type(parse_value(text)) is type(value)
+
+
+def test_settings_are_sorted_by_stage_and_the_last_one_counts():
+    texts = [
+        "zones.gap_gray=9",
+        "zones.sigma_gray = 2",
+        "zones.gap_gray=10",
+        "fusion.strategy=masks",
+    ]
+    assert parse_settings(texts) == {
+        "zones": {"gap_gray": 10, "sigma_gray": 2},
+        "fusion": {"strategy": "masks"},
+    }
+
+
+def test_a_value_may_hold_equals_signs_and_dots():
+    assert parse_settings(["a.b=c=d.e"]) == {"a": {"b": "c=d.e"}}
+
+
+@pytest.mark.parametrize("text", ["zones", "zones=3", "zones.gap_gray", ".gap=3", "zones.=3", "=3"])
+def test_a_setting_of_another_form_is_named(text):
+    with pytest.raises(InvalidSettingError, match=r"STAGE\.FIELD=VALUE"):
+        parse_settings([text])
+
+
+def test_only_options_that_are_given_reach_the_rig():
+    assert parse_rig_options(None) == {}
+    assert parse_rig_options(["bit_depth=12"], scene="metal", seed=3) == {
+        "scene": "metal",
+        "seed": 3,
+        "bit_depth": 12,
+    }
+
+
+@pytest.mark.parametrize("text", ["bit_depth", "=12"])
+def test_a_rig_option_of_another_form_is_named(text):
+    with pytest.raises(InvalidSettingError, match="KEY=VALUE"):
+        parse_rig_options([text])
+
+
+HEAVY = {
+    "numba",
+    "cv2",
+    "scipy",
+    "open3d",
+    "sqlalchemy",
+    "fastapi",
+    "backend.main",
+    "numpy",
+    "rich.progress",
+}
+
+
+def test_help_needs_nothing_heavy():
+    code = "import sys; from backend.cli.application import run; status = run(['--help']); print(*sys.modules, file=sys.stderr); sys.exit(status)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "check-rig" in done.stdout
+    assert HEAVY & set(done.stderr.split()) == set()
