@@ -62,6 +62,10 @@ class Cloud:
     point_count: Annotated[int, Value("Points")]
     median_sigma_mm: Annotated[float, Value("Uncertainty, median", unit="mm")]
     kept_share: Annotated[float, Value("Decoded pixels that became points")]
+    consistency_px: float = float("nan")
+    """Contradiction with the projector that was allowed, in [px]; NaN if it wasn't checked."""
+    speck_px: int = 0
+    """Smallest patch of connected pixels that was kept."""
     cameras: tuple[str, ...] = ()
     """The cameras that the points were made from, the reference first."""
 

@@ -44,6 +44,18 @@ Geometry = Literal["stereo", "projector"]
 Box = Annotated[tuple[float, float, float, float, float, float], "x, y, z from; x, y, z to"]
 
 
+NOISE_SIGMAS = 5.0
+"""What phase noise explains of a contradiction with the projector."""
+
+SPREADS = 4.0
+LEAST_SPREAD_PX = 0.12
+"""Contradiction that is always allowed, and that of the scene itself: what calibration leaves after its drift."""
+
+
+PIXELS_PER_SPECK = 20_000
+"""A patch of fewer than this part of all pixels is chance, not surface."""
+
+
 class StereoCloudParams(Params):
     """How points are made and which are kept."""
 
@@ -58,16 +70,25 @@ class StereoCloudParams(Params):
     """Neighbours whose projector coordinate differs by more are not one surface. Automatic: 5 median steps."""
     settle_by_projector: bool = setting(True, title="Settle doubts by the projector")
     """Where the match is ambiguous and the projector is calibrated, take the place that all three agree on."""
+    check_by_projector: bool = setting(True, title="Check by the projector")
+    """Remove points whose place in the calibrated projector contradicts the measured coordinate: second
+    reflections and mixed pixels. A smooth drift of the projector's calibration is taken off first."""
     consistency_px: float | None = setting(
-        0.15, title="Contradiction with the projector", unit="px", gt=0, le=100
+        None,
+        title="Contradiction allowed",
+        unit="px",
+        gt=0,
+        le=100,
+        auto="consistency_px",
+        advanced=True,
     )
-    """Points whose place in the calibrated projector differs by more than this beyond 5 sigma from the measured
-    coordinate are second reflections or mixed pixels. A smooth drift of the projector's calibration is taken off
-    first. Empty switches the check off."""
+    """Beyond 5 sigma of noise. Automatic: 4 times the scene's own spread, at least 0.12 px."""
     outlier_sigmas: float = setting(6.0, title="Outliers beyond", unit="sigma", ge=0, le=100)
     """Points so far from the median of their 5x5 neighbourhood, and alone there, are removed; 0 = off."""
-    speck_px: int = setting(12, title="Smallest patch", unit="px", ge=0, le=100_000)
-    """Connected patches of fewer pixels are removed; 0 = off."""
+    speck_px: int | None = setting(
+        None, title="Smallest patch", unit="px", ge=0, le=100_000, auto="speck_px"
+    )
+    """Connected patches of fewer pixels are removed; 0 = off. Automatic: one in 20 000 of the picture's pixels."""
     sigma_max_mm: float | None = setting(
         None, title="Largest uncertainty", unit="mm", gt=0, le=1000
     )
@@ -101,6 +122,8 @@ class _Raw:
     points_mm: Float32[np.ndarray, "h w 3"]
     sigma_mm: Float32[np.ndarray, "h w"]
     reasons: UInt16[np.ndarray, "h w"]
+    consistency_px: float = float("nan")
+    """Contradiction with the projector that was allowed; NaN if it wasn't checked."""
 
 
 _Filter = Callable[[_Raw], Kept]
@@ -229,7 +252,7 @@ class _Scene:
         p = self.params
         angle = filters.pixel_angle(self.camera.K)
         steps: list[tuple[str, Reason, _Filter]] = []
-        if p.consistency_px is not None and self._checks_projector():
+        if p.check_by_projector and self._checks_projector():
             steps.append(("contradicts the projector", Reason.EPIPOLAR, self._consistent))
         if p.sigma_max_mm is not None:
             limit = p.sigma_max_mm
@@ -262,17 +285,25 @@ class _Scene:
                     ),
                 )
             )
-        if p.speck_px > 1:
+        least_pixels = self.speck_px
+        if least_pixels > 1:
             steps.append(
                 (
                     "specks",
                     Reason.OUTLIER,
                     lambda r: filters.without_specks(
-                        r.points_mm, least_pixels=p.speck_px, pixel_angle_rad=angle
+                        r.points_mm, least_pixels=least_pixels, pixel_angle_rad=angle
                     ),
                 )
             )
         return steps
+
+    @property
+    def speck_px(self) -> int:
+        """Smallest patch that is kept."""
+        if self.params.speck_px is not None:
+            return self.params.speck_px
+        return int(self.camera.width_px * self.camera.height_px / PIXELS_PER_SPECK)
 
     def _checks_projector(self) -> bool:
         """Tell whether the projector has something to add to what the points were made from."""
@@ -283,7 +314,6 @@ class _Scene:
     def _consistent(self, raw: _Raw) -> Kept:
         assert self.projector is not None
         assert self.projector_from_camera is not None
-        assert self.params.consistency_px is not None
         rows = self.other is None
         maps = self.phase.projector_row_px if rows else self.phase.projector_px
         sigma = (self.phase.sigma_row_px if rows else self.phase.sigma_px)[self.name]
@@ -291,10 +321,10 @@ class _Scene:
             raw.points_mm, maps[self.name], self.projector, self.projector_from_camera, rows=rows
         )
         contradiction -= smooth_drift(contradiction)
-        beyond_noise = np.abs(contradiction) - np.float32(5.0) * np.nan_to_num(sigma)
-        return filters.within_limits(
-            raw.points_mm, beyond_noise, highest=self.params.consistency_px
-        )
+        size = np.abs(contradiction)
+        raw.consistency_px = self.params.consistency_px or _usual_spread(size)
+        beyond_noise = size - np.float32(NOISE_SIGMAS) * np.nan_to_num(sigma)
+        return filters.within_limits(raw.points_mm, beyond_noise, highest=raw.consistency_px)
 
     def apply(self, title: str, reason: Reason, keep: _Filter, raw: _Raw) -> FilterRow:
         """Apply one filter: remove its points and note why."""
@@ -330,5 +360,13 @@ class _Scene:
             point_count=int(np.count_nonzero(valid)),
             median_sigma_mm=float(np.median(sigma)),
             kept_share=int(np.count_nonzero(valid)) / max(decoded, 1),
+            consistency_px=raw.consistency_px,
+            speck_px=self.speck_px,
             cameras=(self.name,) if self.other is None else (self.name, self.other),
         )
+
+
+def _usual_spread(contradiction_px: Float32[np.ndarray, "h w"]) -> float:
+    known = contradiction_px[np.isfinite(contradiction_px)][::11]
+    spread_px = 1.4826 * float(np.median(known)) if known.size else 0.0
+    return max(SPREADS * spread_px, LEAST_SPREAD_PX)
