@@ -10,6 +10,7 @@ from backend.jobs.rigs import RigPool
 from backend.jobs.runner import Runner
 from backend.methods import Registry
 from backend.services.events import EventHub
+from backend.services.fields import ShownResult
 from backend.services.memory import Memory
 from backend.services.rig_offers import offer_rigs
 from backend.storage.artifacts import ArtifactStore
@@ -33,5 +34,7 @@ class Context:
     offers: Callable[[], tuple[RigOffer, ...]] = offer_rigs
     previews: Memory[bytes] = field(default_factory=lambda: Memory(64 << 20, len))
     """Pictures for the screen, up to so many bytes."""
+    shown: Memory[ShownResult] = field(default_factory=lambda: Memory(500))
+    """Results as clients see them."""
     summaries: Memory[ScanSummary] = field(default_factory=lambda: Memory(10_000))
     """Lines of the scan list."""

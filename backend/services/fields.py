@@ -8,10 +8,15 @@ from typing import Any
 
 from backend.contract.scans import ArtifactRef, FieldView, FrameRef
 from backend.domain.hints import Hint
-from backend.domain.stage import shown_fields
+from backend.domain.stage import Stage, shown_fields
+from backend.storage.artifacts import ArtifactStore
 
 _SIBLINGS = ("x", "fit", "valleys", "peaks", "normals", "colour", "faces")
 """Attributes of hints that name another field of the same result."""
+
+
+_MOST_CHOSEN = 256
+"""Arrays up to this size are shown as the value that a stage chose; larger ones are fetched."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +48,43 @@ def _with_texts(shown: _Shown, document: Mapping[str, Any]) -> _Shown:
     return replace(shown, hint={**shown.hint, "labels": labels})
 
 
-def point_count(result_type: type, document: Mapping[str, Any]) -> int | None:
+@dataclass(frozen=True)
+class ShownResult:
+    """What a client sees of a result."""
+
+    fields: tuple[FieldView, ...]
+    chosen: Mapping[str, Any]
+    """Setting -> the value that the stage chose where the setting is automatic."""
+
+
+def shown_result(stage: Stage, document: Mapping[str, Any], store: ArtifactStore) -> ShownResult:
+    """Describe a stored result of a stage."""
+    return ShownResult(field_views(stage.output, document), _chosen(stage, document, store))
+
+
+def point_count(views: tuple[FieldView, ...]) -> int | None:
     """Return how many points a result has; None if it isn't a cloud."""
-    for view in field_views(result_type, document):
+    for view in views:
         if view.hint["kind"] == "points":
             return math.prod(view.arrays[""].shape[:-1]) if "" in view.arrays else None
     return None
+
+
+def small_value(value: Any, store: ArtifactStore) -> Any:
+    """Return a stored value as JSON; an array of a few numbers as a list, a larger one as a reference."""
+    if _is_array(value) and math.prod(value["shape"]) <= _MOST_CHOSEN:
+        return store.get(value["$array"]).tolist()
+    return plain(value)
+
+
+def _chosen(stage: Stage, document: Mapping[str, Any], store: ArtifactStore) -> dict[str, Any]:
+    chosen = {}
+    for name, setting in stage.params.model_fields.items():
+        extra = setting.json_schema_extra
+        field = extra.get("auto") if isinstance(extra, dict) else None
+        if isinstance(field, str):
+            chosen[name] = small_value(document.get(field), store)
+    return chosen
 
 
 def plain(value: Any) -> Any:

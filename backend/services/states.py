@@ -1,8 +1,5 @@
 """The state of a scan, whole, put together from its plan, its runs and its job. Nothing here is stored."""
 
-from collections.abc import Mapping
-from typing import Any
-
 from backend.contract.scans import (
     CheckView,
     DecisionView,
@@ -12,20 +9,17 @@ from backend.contract.scans import (
     SettingView,
     StageState,
 )
+from backend.domain.stage import Stage
 from backend.domain.states import JobStatus, StageStatus, Verdict
 from backend.jobs.edits import last_group
 from backend.jobs.loading import LoadedScan, load_scan
 from backend.jobs.plan import RIG, PlannedStage, gate_holds, run_level
 from backend.jobs.views import job_view
 from backend.services.context import Context
-from backend.services.fields import field_views, plain, point_count
+from backend.services.fields import ShownResult, point_count, shown_result
 from backend.services.words import shown_value
-from backend.storage.artifacts import ArtifactStore
 from backend.storage.repositories import Repositories
-from backend.storage.rows import EditKind, EditRow, JobRow, RunRow, RunStatus, ScanRow
-
-_MOST_CHOSEN = 256
-"""Arrays up to this size are shown as the value that a stage chose; larger ones are fetched."""
+from backend.storage.rows import EditKind, EditRow, GivenRow, JobRow, RunRow, RunStatus, ScanRow
 
 _DONE = (StageStatus.DONE, StageStatus.ACCEPTED, StageStatus.GIVEN)
 
@@ -62,12 +56,10 @@ class Assembly:
         self._job = self._job_view(self._row)
         self._latest = {run.key: run for run in loaded.runs}
         self._unattended: dict[str, bool] = {}
-        self._documents: dict[str, dict[str, Any]] = {}
 
     def state(self) -> ScanState:
         """Return everything that a screen needs, but the arrays."""
         row = self._scan.row
-        self._load_documents()
         stages = tuple(self._stage(planned) for planned in self._scan.plan.stages)
         return ScanState(
             id=row.id,
@@ -98,7 +90,7 @@ class Assembly:
 
     def _stage(self, planned: PlannedStage) -> StageState:
         status = self._status(planned)
-        document = self._document(planned)
+        shown = self._shown(planned)
         attempt = planned.run or self._failed(planned)
         return StageState(
             name=planned.name,
@@ -108,9 +100,9 @@ class Assembly:
             key=planned.key,
             stage_run=attempt.id if attempt else None,
             take=planned.take,
-            settings=self._settings(planned, document),
+            settings=self._settings(planned, shown),
             checks=tuple(CheckView(**check) for check in planned.run.checks) if planned.run else (),
-            fields=field_views(planned.stage.output, document) if document else (),
+            fields=shown.fields if shown else (),
             decision=_decision(planned),
             duration_s=attempt.duration_s if attempt else None,
             started=attempt.started if attempt else None,
@@ -157,14 +149,19 @@ class Assembly:
         run = self._latest.get(planned.key or "")
         return run if run and run.status is RunStatus.FAILED else None
 
-    def _load_documents(self, *stages: PlannedStage) -> None:
-        runs = [p.run.id for p in stages or self._scan.plan.stages if p.run]
-        self._documents = self._repositories.runs.documents(runs)
+    def _shown(self, planned: PlannedStage) -> ShownResult | None:
+        """Describe a result. Equal results look equal: what was described once is remembered under its hash."""
+        result = planned.result
+        if result is None:
+            return None
+        key = (planned.stage.output, planned.stage.params, result.hash)
+        return self._context.shown.get(key, lambda: self._describe(planned.stage, result))
 
-    def _document(self, planned: PlannedStage) -> Mapping[str, Any] | None:
-        if planned.given:
-            return planned.given.document
-        return self._documents[planned.run.id] if planned.run else None
+    def _describe(self, stage: Stage, result: GivenRow | RunRow) -> ShownResult:
+        document = result.document
+        if isinstance(result, RunRow):
+            document = self._repositories.runs.documents([result.id])[result.id]
+        return shown_result(stage, document or {}, self._context.store)
 
     # words
 
@@ -209,27 +206,17 @@ class Assembly:
 
     # settings
 
-    def _settings(
-        self, planned: PlannedStage, document: Mapping[str, Any] | None
-    ) -> dict[str, SettingView]:
+    def _settings(self, planned: PlannedStage, shown: ShownResult | None) -> dict[str, SettingView]:
         settings = planned.settings
+        chosen = shown.chosen if shown else {}
         return {
             name: SettingView(
                 value=value,
                 source=settings.sources[name],
-                chosen=self._chosen(planned, name, document) if value is None else None,
+                chosen=chosen.get(name) if value is None else None,
             )
             for name, value in settings.values.items()
         }
-
-    def _chosen(
-        self, planned: PlannedStage, setting: str, document: Mapping[str, Any] | None
-    ) -> Any:
-        extra = planned.stage.params.model_fields[setting].json_schema_extra
-        field = extra.get("auto") if isinstance(extra, dict) else None
-        if document is None or not isinstance(field, str):
-            return None
-        return small_value(document.get(field), self._context.store)
 
     # the scan
 
@@ -249,9 +236,8 @@ class Assembly:
     def _points(self) -> int | None:
         for planned in reversed(self._scan.plan.stages):
             if any(f.hint.kind == "points" for f in planned.stage.shown):
-                self._load_documents(planned)
-                document = self._document(planned)
-                return point_count(planned.stage.output, document) if document else None
+                shown = self._shown(planned)
+                return point_count(shown.fields) if shown else None
         return None
 
 
@@ -265,17 +251,6 @@ def undo_sentence(scan: LoadedScan) -> str | None:
         return f"{_titles(scan, group)}: go back to take {group[0].old} ({who})."
     changes = ", ".join(f"{row.field} back to {shown_value(row.old)}" for row in group)
     return f"{_titles(scan, group)}: {changes} ({who})."
-
-
-def small_value(value: Any, store: ArtifactStore) -> Any:
-    """Return a stored value as JSON; an array of a few numbers as a list, a larger one as a reference."""
-    if isinstance(value, Mapping) and "$array" in value:
-        size = 1
-        for length in value["shape"]:
-            size *= length
-        if size <= _MOST_CHOSEN:
-            return store.get(value["$array"]).tolist()
-    return plain(value)
 
 
 def _titles(scan: LoadedScan, group: list[EditRow]) -> str:
