@@ -39,7 +39,7 @@ async def take(hub: EventHub, *published: Event) -> list[Event]:
 
 
 def test_events_come_in_order() -> None:
-    published = [
+    published: list[Event] = [
         ScanChanged(scan="a", revision=1),
         progress("j", 0.5),
         ScanChanged(scan="b", revision=2),
