@@ -52,6 +52,7 @@ def decode_gray_code(
     ignored_low_bits: int = 0,
     unjudged_low_bits: int = 0,
     saturation_gray: float = float("inf"),
+    out: GrayCode | None = None,
 ) -> GrayCode:
     r"""Decode a Gray code of which each bit was shown with its inverse.
 
@@ -73,6 +74,8 @@ def decode_gray_code(
         code is 2**n stripes uncertain instead of invalid.
     saturation_gray
         A pixel is saturated where pattern and inverse of one bit both reach this gray level.
+    out
+        Maps to write to, an earlier result: touching new memory costs more than decoding.
 
     Raises
     ------
@@ -97,7 +100,9 @@ def decode_gray_code(
         )
     reading = _reading(bits, codes, ignored_low_bits, unjudged_low_bits)
     frames = [*patterns[: reading.read], *inverses[: reading.read]]
-    return _decode(frames, reading, _INVERSE, codes, size_px, min_contrast_gray, saturation_gray)
+    return _decode(
+        frames, reading, _INVERSE, codes, size_px, min_contrast_gray, saturation_gray, out=out
+    )
 
 
 def decode_gray_code_by_reference(
@@ -208,9 +213,15 @@ def _decode(
     min_contrast_gray: float,
     saturation_gray: float,
     double_threshold_gray: int = 0,
+    out: GrayCode | None = None,
 ) -> GrayCode:
     stack = frame_stack(frames)
-    result = GrayCode(
+    if out is not None and out.code.shape != stack.shape:
+        raise FrameError(
+            f"maps of shape {out.code.shape} can't take pictures of {stack.shape}: "
+            "give maps of this size"
+        )
+    result = out or GrayCode(
         code=np.empty(stack.shape, np.int32),
         projector_px=np.empty(stack.shape, np.float32),
         contrast_gray=np.empty(stack.shape, np.uint16),

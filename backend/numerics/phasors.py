@@ -77,6 +77,7 @@ def fuse_exposures(
     saturation_gray: float,
     strategy: Fusion = "weighted",
     exposure_index: UInt8[np.ndarray, "h w"] | None = None,
+    out: Phasors | None = None,
 ) -> Phasors:
     r"""Fuse the frames of one or several exposures into one phasor per pixel and frequency.
 
@@ -99,6 +100,8 @@ def fuse_exposures(
         "masks": the exposure that `exposure_index` names, saturated or not.
     exposure_index
         For "masks": index of each pixel's exposure, 255 for background.
+    out
+        Maps to write to, an earlier result: touching new memory costs as much as fusing.
 
     Returns
     -------
@@ -144,7 +147,12 @@ def fuse_exposures(
         )
     wanted = _wanted_exposures(strategy, exposure_index, shape, len(exposure))
     n_frequencies = len(code.periods)
-    phasors = Phasors(
+    if out is not None and out.in_phase_gray.shape != (n_frequencies, *shape):
+        raise FrameError(
+            f"maps of shape {out.in_phase_gray.shape} can't take {n_frequencies} frequencies of "
+            f"{shape}: give maps of this size"
+        )
+    phasors = out or Phasors(
         in_phase_gray=np.empty((n_frequencies, *shape), np.float32),
         quadrature_gray=np.empty((n_frequencies, *shape), np.float32),
         mean_gray=np.empty((n_frequencies, *shape), np.float32),

@@ -114,9 +114,9 @@ def test_fusing_three_exposures_and_finding_the_position(benchmark):
     exposures = [scene.frames(CODE, exposure_ms=t, sigma_gray=1.5) for t in exposure_ms]
     orders = maximum_likelihood(CODE.periods)
 
-    def fuse():
+    def fuse(out=None):
         return fuse_exposures(
-            exposures, CODE, exposure_ms=exposure_ms, noise=NOISE, saturation_gray=254
+            exposures, CODE, exposure_ms=exposure_ms, noise=NOISE, saturation_gray=254, out=out
         )
 
     def fuse_numpy():
@@ -137,11 +137,19 @@ def test_fusing_three_exposures_and_finding_the_position(benchmark):
         return absolute_phase(phasors, CODE, orders, size_px=SIZE_PX, limits=Limits(), out=maps)
 
     everything = [frame for frames in exposures for frame in frames]
-    times = best_ms({"copy": copier(everything), "fuse": fuse, "locate": locate}, rounds=20)
+    times = best_ms(
+        {
+            "copy": copier(everything),
+            "fuse": lambda: fuse(phasors),
+            "locate": locate,
+            "new_maps": fuse,
+        },
+        rounds=20,
+    )
     times["numpy"] = best_ms({"numpy": fuse_numpy}, rounds=2)["numpy"]
     report(benchmark, times, fuse)
-    # Nine float maps are written, twice as much as is read, into memory that is new each time.
-    assert times["fuse"] <= 16 * times["copy"]
+    # Ten float maps are written, more than is read.
+    assert times["fuse"] <= 8 * times["copy"]
     assert times["fuse"] * 3 <= times["numpy"]
     # Ten float maps are read, more than all the frames.
     assert times["locate"] <= 6 * times["copy"]
@@ -171,10 +179,12 @@ def test_gray_code_of_44_frames_takes_at_most_three_copies(benchmark):
                 noisy = plane + rng.integers(0, 20, (height, width), dtype=np.uint8)
                 sets.setdefault(axis, ([], []))[inverse].append(noisy)
 
+    maps = {axis: decode_gray_code(*sets[axis], codes=size, size_px=size) for axis, size, _ in axes}
+
     def decode():
         return [
-            decode_gray_code(*sets[axis], codes=size, size_px=size)
-            for axis, size in (("x", 1280), ("y", 800))
+            decode_gray_code(*sets[axis], codes=size, size_px=size, out=maps[axis])
+            for axis, size, _ in axes
         ]
 
     def decode_numpy():

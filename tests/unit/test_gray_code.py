@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -79,7 +81,7 @@ def test_bits_without_contrast_may_be_read_unjudged():
     patterns = frames_of(1280, 11, columns=COLUMNS)
     inverses = frames_of(1280, 11, columns=COLUMNS, inverse=True)
     patterns[10][0] = inverses[10][0] = 60
-    arguments = {"codes": 1280, "size_px": WIDTH_PX}
+    arguments: dict[str, Any] = {"codes": 1280, "size_px": WIDTH_PX}
     judged = decode_gray_code(patterns, inverses, **arguments)
     assert (judged.reasons[0] == int(Reason.CODE_MARGIN)).all()
     unjudged = decode_gray_code(patterns, inverses, unjudged_low_bits=1, **arguments)
@@ -87,6 +89,20 @@ def test_bits_without_contrast_may_be_read_unjudged():
     assert (unjudged.contrast_gray == 100).all()
     assert (unjudged.code[1] == COLUMNS[1]).all()
     assert np.abs(unjudged.code[0] - COLUMNS[0]).max() == 1
+
+
+def test_maps_are_reused_when_given_and_have_to_fit():
+    patterns = frames_of(16, 4, columns=COLUMNS)
+    inverses = frames_of(16, 4, columns=COLUMNS, inverse=True)
+    arguments: dict[str, Any] = {"codes": 16, "size_px": WIDTH_PX}
+    first = decode_gray_code(patterns, inverses, **arguments)
+    expected = first.code.copy()
+    first.code[:] = 99
+    assert decode_gray_code(patterns, inverses, out=first, **arguments) is first
+    assert (first.code == expected).all()
+    turned = [[np.ascontiguousarray(frame.T) for frame in part] for part in (patterns, inverses)]
+    with pytest.raises(FrameError, match="give maps of this size"):
+        decode_gray_code(*turned, out=first, **arguments)
 
 
 def test_codes_beyond_the_projector_are_outside():
@@ -160,7 +176,7 @@ def test_references_work_per_pixel_and_a_threshold_does_not():
     ],
 )
 def test_codes_that_do_not_fit_are_refused(change, error, message):
-    arguments = {
+    arguments: dict[str, Any] = {
         "patterns": [np.zeros((2, 3), np.uint8)] * 4,
         "inverses": [np.zeros((2, 3), np.uint8)] * 4,
         "codes": 16,

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -150,6 +152,18 @@ def test_misfit_is_the_noise_for_sinusoids_and_more_with_harmonics():
     assert np.median(sinusoid_misfit(bent, code)) > 2.5
 
 
+def test_maps_are_reused_when_given_and_have_to_fit():
+    frames = Scene(X).frames(CODE)
+    arguments: dict[str, Any] = {"exposure_ms": [1.0], "noise": NOISE, "saturation_gray": 254.0}
+    first = fuse_exposures([frames], CODE, **arguments)
+    expected = first.in_phase_gray.copy()
+    first.in_phase_gray[:] = 0
+    assert fuse_exposures([frames], CODE, out=first, **arguments) is first
+    assert (first.in_phase_gray == expected).all()
+    with pytest.raises(FrameError, match="give maps of this size"):
+        fuse_exposures([[frame[:2] for frame in frames]], CODE, out=first, **arguments)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -167,7 +181,7 @@ def test_misfit_is_the_noise_for_sinusoids_and_more_with_harmonics():
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_does_not_fit_together_is_refused(change, message):
-    arguments = {
+    arguments: dict[str, Any] = {
         "exposures": [[np.zeros((4, 5), np.uint8)] * 8],
         "exposure_ms": [1.0],
         "noise": NOISE,
