@@ -64,6 +64,8 @@ class Cloud:
     kept_share: Annotated[float, Value("Decoded pixels that became points")]
     consistency_px: float = float("nan")
     """Contradiction with the projector that was allowed, in [px]; NaN if it wasn't checked."""
+    residual_max_cycles: float = float("inf")
+    """Disagreement of the frequencies that was allowed, in [cycles]; infinite if it wasn't judged."""
     speck_px: int = 0
     """Smallest patch of connected pixels that was kept."""
     cameras: tuple[str, ...] = ()

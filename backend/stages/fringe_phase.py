@@ -19,11 +19,13 @@ from backend.numerics import absolute_phase as numerics
 from backend.numerics import fringe_orders
 from backend.numerics.fringe_orders import FringeOrders
 from backend.numerics.phasors import Phasors as FusedFrames
-from backend.numerics.reasons import Reason
 from backend.stages.cloud import REASON_LABELS
 from backend.stages.fusion import AxisPhasors, Phasors, first_of_each_camera
 
 Unwrapping = Literal["maximum_likelihood", "cascade", "hierarchical", "gray_code"]
+
+ORDER_SHARE = 0.99
+"""Of half the distance between two fringe orders: beyond, the nearest order is a guess."""
 
 
 class FringePhaseParams(Params):
@@ -42,16 +44,8 @@ class FringePhaseParams(Params):
         le=0.5,
         auto="residual_max_cycles",
     )
-    """By how much the frequencies may disagree. Automatic: 0.7 of what mixes up two fringe orders."""
-    residual_sigmas: float = setting(
-        6.0, title="Contradiction over noise", unit="sigma", ge=0, le=100, advanced=True
-    )
-    """Also reject where the frequencies disagree by more than so many times the pixel's predicted noise
-    (a second reflection); 0 switches this off."""
-    residual_floor_cycles: float = setting(
-        0.015, title="Contradiction always allowed", unit="cycles", ge=0, le=0.5, advanced=True
-    )
-    """What gamma, harmonics and calibration may add to the noise."""
+    """By how much the frequencies may disagree. Automatic: just what mixes up two fringe orders; the cloud judges
+    second reflections with more knowledge."""
     guard_band: float = setting(0.002, title="Guard band", ge=0, le=0.2, advanced=True)
     """Share of the projector's width left out at both ends, where the code may wrap."""
 
@@ -152,7 +146,7 @@ def _automatic(axis: AxisPhasors) -> Unwrapping:
 def decode(
     axis: AxisPhasors, orders: FringeOrders, size_px: int, params: FringePhaseParams
 ) -> numerics.AbsolutePhase:
-    """Decode one camera along one direction, and reject contradictions above the noise."""
+    """Decode one camera along one direction."""
     fused = FusedFrames(
         axis.in_phase_gray,
         axis.quadrature_gray,
@@ -163,9 +157,9 @@ def decode(
         axis.reasons,
     )
     limits = numerics.Limits(
-        params.modulation_min_gray, params.residual_max_cycles, params.guard_band
+        params.modulation_min_gray, _residual_limit(orders, params), params.guard_band
     )
-    decoded = numerics.absolute_phase(
+    return numerics.absolute_phase(
         fused,
         axis.code,
         orders,
@@ -174,27 +168,14 @@ def decode(
         black_gray=axis.black_gray,
         coarse_px=None if axis.gray is None else axis.gray.position_px,
     )
-    _reject_contradictions(decoded, axis, params)
-    return decoded
 
 
-def _reject_contradictions(
-    decoded: numerics.AbsolutePhase, axis: AxisPhasors, params: FringePhaseParams
-) -> None:
-    """Reject where the frequencies disagree more than noise explains: light that came two ways."""
-    if params.residual_sigmas == 0:
-        return
-    noise_gain = np.float32(np.sqrt(max(axis.code.noise_gains)) / (2 * np.pi))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sigma_cycles = axis.sigma_gray * (noise_gain / decoded.modulation_gray)
-    limit = (
-        np.float32(params.residual_floor_cycles) + np.float32(params.residual_sigmas) * sigma_cycles
-    )
-    doubtful = (decoded.residual_cycles > limit) & (decoded.reasons == 0)
-    decoded.reasons[doubtful] |= np.uint16(Reason.ORDER_RESIDUAL)
-    decoded.projector_px[doubtful] = np.nan
-    if decoded.sigma_px is not None:
-        decoded.sigma_px[doubtful] = np.nan
+def _residual_limit(orders: FringeOrders, params: FringePhaseParams) -> float:
+    if params.residual_max_cycles is not None:
+        return params.residual_max_cycles
+    if orders.strategy == "maximum_likelihood":
+        return ORDER_SHARE * orders.distance_cycles / 2
+    return orders.default_residual_cycles
 
 
 def _summarise(
@@ -222,7 +203,7 @@ def _summarise(
         valid_share=valid / sum(int(d.reasons.size) for d in main.values()),
         median_sigma_px=float(np.median(finite)) if finite.size else float("nan"),
         unwrapping=orders.strategy.replace("_", " "),
-        residual_max_cycles=params.residual_max_cycles or orders.default_residual_cycles,
+        residual_max_cycles=_residual_limit(orders, params),
         full_scale_gray=facts.cameras[facts.reference].full_scale_gray,
     )
 

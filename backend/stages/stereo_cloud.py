@@ -48,9 +48,12 @@ NOISE_SIGMAS = 5.0
 """What phase noise explains of a contradiction with the projector."""
 
 SPREADS = 4.0
-LEAST_SPREAD_PX = 0.12
+LEAST_SPREAD_PX = 0.06
 """Contradiction that is always allowed, and that of the scene itself: what calibration leaves after its drift."""
 
+
+RESIDUAL_MAX_CYCLES = 0.015
+"""Disagreement of the frequencies that noise rarely reaches and a second reflection usually exceeds."""
 
 PIXELS_PER_SPECK = 20_000
 """A patch of fewer than this part of all pixels is chance, not surface."""
@@ -82,7 +85,17 @@ class StereoCloudParams(Params):
         auto="consistency_px",
         advanced=True,
     )
-    """Beyond 5 sigma of noise. Automatic: 4 times the scene's own spread, at least 0.12 px."""
+    """Beyond 5 sigma of noise. Automatic: 4 times the scene's own spread, at least 0.06 px."""
+    residual_max_cycles: float | None = setting(
+        None,
+        title="Contradiction of the frequencies",
+        unit="cycles",
+        gt=0,
+        le=0.5,
+        auto="residual_max_cycles",
+    )
+    """Points whose frequencies disagree by more are second reflections. Automatic: 0.015 where no projector
+    can check them, else no limit here."""
     outlier_sigmas: float = setting(6.0, title="Outliers beyond", unit="sigma", ge=0, le=100)
     """Points so far from the median of their 5x5 neighbourhood, and alone there, are removed; 0 = off."""
     speck_px: int | None = setting(
@@ -254,6 +267,8 @@ class _Scene:
         steps: list[tuple[str, Reason, _Filter]] = []
         if p.check_by_projector and self._checks_projector():
             steps.append(("contradicts the projector", Reason.EPIPOLAR, self._consistent))
+        if np.isfinite(self.residual_max_cycles):
+            steps.append(("contradicting frequencies", Reason.ORDER_RESIDUAL, self._undisputed))
         if p.sigma_max_mm is not None:
             limit = p.sigma_max_mm
             steps.append(
@@ -311,6 +326,18 @@ class _Scene:
             self.other is not None or bool(self.phase.projector_row_px)
         )
 
+    @property
+    def residual_max_cycles(self) -> float:
+        """Largest disagreement of the frequencies; infinite if that isn't judged here."""
+        if self.params.residual_max_cycles is not None:
+            return self.params.residual_max_cycles
+        checked = self.params.check_by_projector and self._checks_projector()
+        return float("inf") if checked else RESIDUAL_MAX_CYCLES
+
+    def _undisputed(self, raw: _Raw) -> Kept:
+        residual = self.phase.residual_cycles[self.name]
+        return filters.within_limits(raw.points_mm, residual, highest=self.residual_max_cycles)
+
     def _consistent(self, raw: _Raw) -> Kept:
         assert self.projector is not None
         assert self.projector_from_camera is not None
@@ -362,6 +389,7 @@ class _Scene:
             kept_share=int(np.count_nonzero(valid)) / max(decoded, 1),
             consistency_px=raw.consistency_px,
             speck_px=self.speck_px,
+            residual_max_cycles=self.residual_max_cycles,
             cameras=(self.name,) if self.other is None else (self.name, self.other),
         )
 
