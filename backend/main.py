@@ -236,6 +236,15 @@ def _alone_in(folder: Path) -> Iterator[None]:
         yield
 
 
+def is_served(folder: Path) -> bool:
+    """Tell whether a server uses a data folder now."""
+    try:
+        with _alone_in(folder):
+            return False
+    except StartupError:
+        return True
+
+
 def _reachable(host: str) -> str:
     """Return how this machine itself reaches the server, for an address."""
     if host in _EVERYWHERE:

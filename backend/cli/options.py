@@ -69,10 +69,12 @@ def parse_value(text: str) -> Any:
 
     Examples
     --------
-    >>> parse_value("3"), parse_value("null"), parse_value("16.7, 100"), parse_value("fast")
-    (3, None, [16.7, 100], 'fast')
+    >>> parse_value("3"), parse_value("null"), parse_value("fast")
+    (3, None, 'fast')
+    >>> parse_value("16.7, 100"), parse_value("50,")
+    ([16.7, 100], [50])
     """
-    for attempt in (text, f"[{text}]" if "," in text else text):
+    for attempt in (text, f"[{text.removesuffix(',')}]" if "," in text else text):
         try:
             return json.loads(attempt, parse_constant=_refuse_constant)
         except ValueError:

@@ -75,10 +75,22 @@ def scan(
         with open_services(data, progress) as services:
             refuse_place(services, out)
             progress.step("rig", 0.0, "opening")
+            if resume:
+                end_dead_job(services, resume, data)
             chosen = resume or services.create_scan(request, who()).id
             run_and_export(services, chosen, answer, progress, out=out, frames=frames)
     if not as_json:
         show_summary(answer)
+
+
+def end_dead_job(services: "Services", scan_id: str, data: Path | None) -> None:
+    """Mark a scan's job as interrupted if the command that ran it was killed: no server is there to do so."""
+    from backend.main import is_served
+    from backend.settings import load_settings
+
+    job = services.scan(scan_id).job
+    if job and not job.status.ended and not is_served(load_settings(data_folder=data).data_folder):
+        services.cancel(scan_id, who())
 
 
 def refuse_place(services: "Services", out: Path | None) -> None:

@@ -9,9 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from backend import main
 from backend.cli.application import run
+from backend.cli.serving import begin_first_scan
+from backend.contract.requests import CreateScan
+from backend.devices.sim import SimulatedRig
+from backend.domain.states import JobStatus
 from backend.jobs.runner import JobThreads
 from backend.services.ply import read_ply
+from backend.storage.database import utc_now
+from backend.storage.rows import JobRow
+from tests.scans.houses import real_house
 
 SMALL = ("--scene", "plane", "--size", "160x120")
 
@@ -194,6 +202,19 @@ def test_ctrl_c_cancels_and_keeps_the_scan(unglare, monkeypatch):
     assert again.answer["status"] == "finished"
 
 
+def test_a_scan_whose_process_was_killed_goes_on(unglare, tmp_path):
+    with real_house(tmp_path / "data") as services:
+        options = {"scene": "plane", "size": "160x120"}
+        request = CreateScan(method="hdr-fringe", rig_options=options)
+        scan = services.create_scan(request, "ada").id
+        job = JobRow("job", scan, JobStatus.RUNNING, "ada", utc_now(), unattended=True)
+        with services.context.database.transaction() as repositories:
+            repositories.jobs.add(job)
+    done = unglare("scan", "--resume", scan, "--json", "--quiet")
+    assert done.status == 0, done.err
+    assert done.answer["status"] == "finished"
+
+
 def test_methods_are_described_as_json(unglare):
     answer = unglare("methods", "--json").answer
     assert {"hdr-fringe", "adaptive-code"} <= {m["name"] for m in answer["methods"]}
@@ -238,9 +259,7 @@ def test_noise_is_as_predicted(unglare):
 
 
 def test_noise_needs_a_rig_that_is_what_it_says(unglare, monkeypatch):
-    """Twice the read noise that the facts tell has to show."""
-    from backend.devices.sim import SimulatedRig
-
+    """Facts that promise less noise than there is have to show."""
     facts = SimulatedRig.facts
 
     def boast(self):
@@ -287,8 +306,6 @@ def test_the_built_in_benchmark_reports(unglare):
 
 
 def test_serve_passes_its_options_on(unglare, monkeypatch, tmp_path):
-    from backend import main
-
     seen = []
     monkeypatch.setattr(main, "serve", lambda settings, **options: seen.append((settings, options)))
     unglare("serve", "--port", "0", "--host", "127.0.0.2", "--data", tmp_path / "d", "--rig", "a:b")
@@ -308,9 +325,6 @@ def test_a_bad_setting_of_the_server_is_one_sentence(unglare, monkeypatch):
 
 
 def test_the_demo_begins_one_scan_and_no_second(tmp_path):
-    from backend.cli.serving import begin_first_scan
-    from tests.scans.houses import real_house
-
     with real_house(tmp_path) as services:
         options = {"scene": "plane", "size": "160x120"}
         begin_first_scan(services, options)
@@ -321,9 +335,6 @@ def test_the_demo_begins_one_scan_and_no_second(tmp_path):
 
 
 def test_a_demo_whose_rig_cannot_be_opened_serves_all_the_same(tmp_path, caplog):
-    from backend.cli.serving import begin_first_scan
-    from tests.scans.houses import real_house
-
     with real_house(tmp_path) as services:
         begin_first_scan(services, {"scene": "magic"})
     assert "no scene 'magic'" in caplog.text

@@ -19,6 +19,7 @@ from backend.domain.errors import InvalidSettingError
         ("true", True),
         ("[1, 2]", [1, 2]),
         ("16.7,100", [16.7, 100]),
+        ("50,", [50]),
         ('"3"', "3"),
         ("fast", "fast"),
         ("sprayed:metal", "sprayed:metal"),
