@@ -98,10 +98,10 @@ def row_loop(function: Function) -> Function:
 
 @no_type_check
 @intrinsic
-def _pointer(typingctx, address):  # noqa: ANN001, ANN202
+def _pointer(typingctx, address):  # noqa: ANN001, ANN202  numba takes the types from the call
     """Read an integer as the address of untyped memory."""
 
-    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202  numba takes the types from the call
         return builder.inttoptr(arguments[0], cgutils.voidptr_t)
 
     return types.voidptr(types.uintp), codegen
@@ -124,7 +124,7 @@ def new_work() -> Work:
 
 @no_type_check
 @intrinsic
-def take_next(typingctx, counter):  # noqa: ANN001, ANN201
+def take_next(typingctx, counter):  # noqa: ANN001, ANN201  numba takes the types from the call
     """Take the next number from the counter of a `Work`.
 
     numba gives each thread an equal share of a `prange`; when other programs keep one core busy the
@@ -134,7 +134,7 @@ def take_next(typingctx, counter):  # noqa: ANN001, ANN201
             share(work.counter, n, ...)  # tile = take_next(counter); while tile < n: ...
     """
 
-    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+    def codegen(context, builder, signature, arguments):  # noqa: ANN001, ANN202  numba takes the types from the call
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
         one = context.get_constant(types.int64, 1)
         return builder.atomic_rmw("add", array.data, one, "monotonic")
@@ -144,14 +144,14 @@ def take_next(typingctx, counter):  # noqa: ANN001, ANN201
 
 @no_type_check
 @numba.njit(inline="always")
-def narrow_part(address, start, length):  # noqa: ANN001, ANN201
+def narrow_part(address, start, length):  # noqa: ANN001, ANN201  numba takes the types from the call
     """View `length` pixels from pixel `start` on of the uint8 frame at `address`."""
     return numba.carray(_pointer(np.uintp(address + start)), (length,), np.uint8)
 
 
 @no_type_check
 @numba.njit(inline="always")
-def wide_part(address, start, length):  # noqa: ANN001, ANN201
+def wide_part(address, start, length):  # noqa: ANN001, ANN201  numba takes the types from the call
     """View `length` pixels from pixel `start` on of the uint16 frame at `address`."""
     return numba.carray(_pointer(np.uintp(address + 2 * start)), (length,), np.uint16)
 

@@ -75,9 +75,10 @@ def no_zip(path: Path) -> Path:
 
 
 def twice(path: Path) -> Path:
-    with zipfile.ZipFile(path, "w") as zipped, pytest.warns(UserWarning, match="Duplicate name"):
+    with zipfile.ZipFile(path, "w") as zipped:
         zipped.writestr("capture.json", "{}")
-        zipped.writestr("capture.json", "{}")
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            zipped.writestr("capture.json", "{}")
     return path
 
 
@@ -178,8 +179,12 @@ def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_the_folder_of_an_upload_is_gone_afterwards(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), upload_folder(tmp_path / "uploads") as folder:
-        (folder / "half").write_bytes(b"x")
-        raise RuntimeError
+    def fail() -> None:
+        with upload_folder(tmp_path / "uploads") as folder:
+            (folder / "half").write_bytes(b"x")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
 
     assert list((tmp_path / "uploads").iterdir()) == []
