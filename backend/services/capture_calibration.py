@@ -6,14 +6,14 @@ from jaxtyping import Float
 from backend.contract.capture import Capture, CapturedCamera, CapturedProjector, Extrinsics
 from backend.domain.errors import InvalidCalibrationError
 from backend.domain.rig import PinholeModel, Pose, RigCalibration
-from backend.numerics.camera_model import (
+from backend.numerics.errors import CalibrationError
+from backend.numerics.pinhole import (
     Pinhole,
     RigidTransform,
     check_pinhole,
     compose,
     inverse,
 )
-from backend.numerics.errors import CalibrationError
 
 PROJECTOR = "projector"
 

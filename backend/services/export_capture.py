@@ -19,7 +19,7 @@ from backend.contract.capture import (
 from backend.domain.method import Method
 from backend.domain.rig import CameraFacts, PinholeModel, Pose, RigCalibration, RigFacts
 from backend.domain.shots import Progress
-from backend.numerics.camera_model import RigidTransform, compose, inverse
+from backend.numerics.pinhole import RigidTransform, compose, inverse
 from backend.services.capture_calibration import PROJECTOR
 from backend.services.export_folder import Array, ExportFolder, safe_name
 from backend.storage.artifacts import ArtifactStore

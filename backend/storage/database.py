@@ -12,7 +12,6 @@ from sqlalchemy.orm import Session
 
 from backend.domain.errors import StartupError
 from backend.storage.failures import as_expected, cannot_open
-from backend.storage.migrate import upgrade
 from backend.storage.repositories import Repositories
 
 _BUSY_TIMEOUT_MS = 30_000
@@ -48,6 +47,9 @@ class Database:
 
     def upgrade(self) -> None:
         """Bring the tables up to date, all or nothing; StartupError if a newer version made them."""
+        # Alembic takes a third of a second to import, which a command that only shows its help shouldn't wait for.
+        from backend.storage.migrate import upgrade
+
         with cannot_open(self._url), self.engine.begin() as connection:
             upgrade(connection)
 
