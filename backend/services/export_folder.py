@@ -54,7 +54,7 @@ class ExportFolder:
 
     def write_array(self, name: str, array: Array) -> None:
         """Write an array as `.npy`."""
-        flat = np.ascontiguousarray(array)
+        flat = np.asarray(array, order="C")
         self.write(name, (_npy_header(flat), flat.reshape(-1).view(np.uint8).data))
 
     def write_json(self, name: str, document: Any) -> None:
