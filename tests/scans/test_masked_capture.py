@@ -98,7 +98,8 @@ def test_the_mask_is_a_picture_for_others(exported):
     (name,) = masks - {None}
     picture = cv2.imread(str(folder / str(name)), cv2.IMREAD_UNCHANGED)
     assert picture is not None
-    assert (picture.dtype, picture.shape) == (np.uint16, PROJECTOR_PX[::-1])
+    assert picture.dtype == np.dtype(np.uint16)
+    assert picture.shape == PROJECTOR_PX[::-1]
     assert picture[0, 0] == pytest.approx(65535 / 3, abs=1)
     assert picture[-1, -1] == 65535
 
