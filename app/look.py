@@ -68,6 +68,14 @@ class Look:
         return self.describe(self.stage.name)
 
     @property
+    def captures(self) -> bool:
+        """True if a stage of this scan takes pictures: not where they were imported."""
+        return any(
+            s.status not in ("given", "unavailable") and (d := self.describe(s.name)) and d.captures
+            for s in self.scan.stages
+        )
+
+    @property
     def draft(self) -> Mapping[str, Any]:
         """Edits of the stage on the screen that are not applied yet."""
         return self.drafts.get(self.stage.name, {})

@@ -82,6 +82,9 @@ class Session:
         self._methods: dict[str, MethodDescription] = {}
         self._draft_errors: dict[str, str] = {}
         self._reason = ""
+        self._showing_by_itself = False
+        self._left_by_hand = ""
+        """Scan whose enlarged picture the operator closed: it doesn't come back by itself."""
         self._stopping = threading.Event()
         self._acts = Worker(f"acts {client.client_id}", self._report)
         self._loads = Worker(f"loads {client.client_id}", self._report)
@@ -202,6 +205,7 @@ class Session:
 
     def leave_inspection(self) -> None:
         """Show the scene again."""
+        self._left_by_hand = self._look.scan.id if self._look is not None else ""
         self.load(self._leave_inspection, key="inspect")
 
     # ---- building
@@ -497,16 +501,30 @@ class Session:
     def _draw_loaded(self, look: Look) -> None:
         if self._look is None or self._look.scan.id != look.scan.id:
             return
+        self._rig.draw(look)  # first: it says how the scene lies
         self._review.draw(look)
-        self._pictures.draw(look)
-        self._rig.draw(look)
         self._cloud.draw(look)
+        self._pictures.draw(look)
+        self._rig.draw_pictures(look)
         if is_live(look) and self._rig.rig is not None:
             for camera in self._rig.rig.cameras:
                 self._show_live(look.scan.rig, camera.name)
+        self._draw_inspection(look)
+
+    def _draw_inspection(self, look: Look) -> None:
+        """Keep an enlarged picture up to date; where there is neither rig nor cloud, show one by itself."""
+        is_bare = not (self._rig.has_place or self._cloud.is_shown)
         if self._inspector.is_open:
-            self._cloud.set_panel_visible(False)
-            self._refresh_inspection(look)
+            if self._showing_by_itself and not is_bare:
+                self._leave_inspection()
+            else:
+                self._cloud.set_panel_visible(False)
+                self._refresh_inspection(look)
+        elif is_bare and not is_live(look) and self._left_by_hand != look.scan.id:
+            _, figures = self._pictures.figures()
+            if figures:
+                self._inspect(figures[0].camera)
+                self._showing_by_itself = True
 
     def _show_rig(self) -> None:
         chosen = self._new_scan.chosen_rig() if self._new_scan is not None else None
@@ -524,7 +542,7 @@ class Session:
             self._rig.show(rig, "")
 
     def _inspect(self, camera: str) -> None:
-        look = self._look
+        look, self._showing_by_itself = self._look, False
         if look is None:
             return
         title, figures = self._pictures.figures()

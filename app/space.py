@@ -91,15 +91,15 @@ class Space:
     def view_rig(self) -> None:
         """Look from the front at rig and part together."""
         middle = np.array([0.0, 0.0, 0.42 * self._reach])
-        self._look(middle, 0.64 * self._reach, _ELEVATION_RAD)
+        self._look(middle, 0.67 * self._reach, _ELEVATION_RAD)
 
-    def view_part(self, radius: float) -> None:
-        """Look at the part alone."""
-        self._look(np.array([0.0, 0.0, 0.12 * radius]), 1.02 * radius, np.deg2rad(58.0))
+    def view_part(self, middle: Array, radius: float) -> None:
+        """Look at the part alone, from above and in front."""
+        self._look(middle, 1.02 * radius, np.deg2rad(58.0))
 
-    def view_top(self, radius: float) -> None:
+    def view_top(self, middle: Array, radius: float) -> None:
         """Look down on the part, as the cameras do."""
-        self._look(np.zeros(3), radius, np.deg2rad(89.0))
+        self._look(middle, 1.02 * radius, np.deg2rad(89.0))
 
     def pose(self) -> tuple[Array, Array]:
         """Return where the viewer is and what is looked at."""

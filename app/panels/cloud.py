@@ -49,13 +49,13 @@ class CloudPanel:
         self._ground: Ground | None = None
         self._make_panel(client.gui)
 
-    @property
-    def radius(self) -> float:
-        """Size of the cloud in scene units, from its middle outwards."""
-        if self._cloud is None or not len(self._cloud.points_mm):
-            return 2.0
+    def extent(self) -> tuple[Any, float]:
+        """Return where the middle of the cloud is in the scene, and how far it reaches from there."""
+        if self._cloud is None:
+            return np.zeros(3), 2.0
         low, high = np.percentile(self._cloud.points_mm, [2, 98], axis=0)
-        return 0.5 * float(np.linalg.norm(high - low)) * UNIT
+        middle = self._space.placement.to_scene((low + high) / 2)
+        return middle, 0.5 * float(np.linalg.norm(high - low)) * UNIT
 
     @property
     def is_shown(self) -> bool:
@@ -176,7 +176,7 @@ class CloudPanel:
         middle = np.median(cloud.points_mm, axis=0).astype(np.float64)
         on_floor = middle - (middle @ self._ground.up - self._ground.offset_mm) * self._ground.up
         self._space.place(Placement.of(self._ground.up, placement.R[0], on_floor))
-        self._space.view_part(self.radius)
+        self._space.view_part(*self.extent())
 
     def _add_points(self, cloud: PointsPreview) -> None:
         colours = points_view.colours(cloud, self._modes[self._colour.value])
@@ -235,8 +235,8 @@ class CloudPanel:
     def _views(self) -> list[tuple[str, Callable[[], None]]]:
         return [
             ("rig", lambda: self._desk.act(self._space.view_rig)),
-            ("part", lambda: self._desk.act(lambda: self._space.view_part(self.radius))),
-            ("top", lambda: self._desk.act(lambda: self._space.view_top(self.radius))),
+            ("part", lambda: self._desk.act(lambda: self._space.view_part(*self.extent()))),
+            ("top", lambda: self._desk.act(lambda: self._space.view_top(*self.extent()))),
         ]
 
     def _draw_mesh(self, found: tuple[StageState, FieldView] | None) -> None:

@@ -14,6 +14,7 @@ from app.client import ApiClient
 from app.desk import Desk
 from app.look import Look, fields_of_kind
 from app.numbers import quantity
+from app.palette import BACKGROUND
 from app.space import Space
 from app.views.mask import Labels
 from app.views.picture import Figure
@@ -291,10 +292,15 @@ def _project(camera: CameraView, point_mm: Any) -> tuple[int, int]:
 
 
 def decoded(body: bytes) -> Any:
-    """Return RGB from the bytes of a picture."""
-    picture = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)
+    """Return RGB from the bytes of a picture; what is transparent gets the background's colour."""
+    picture = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture is not None, "the API sends PNG and JPEG"
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    if picture.ndim == 2:
+        return cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB)
+    rgb = cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2RGB)
+    if picture.shape[2] == 4:
+        rgb[picture[..., 3] == 0] = BACKGROUND
+    return rgb
 
 
 def decoded_url(address: str) -> Any:

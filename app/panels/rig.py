@@ -35,9 +35,12 @@ class RigPanel:
         return names.index(camera) if camera in names else len(names)
 
     def draw(self, look: Look) -> None:
-        """Show the rig of this scan and what its cameras saw last."""
+        """Show the rig of this scan."""
         if self._shown_for != look.scan.id:
             self.show(self._rig_of(look.scan.id), look.scan.id)
+
+    def draw_pictures(self, look: Look) -> None:
+        """Show what its cameras saw last."""
         if self._frustums is None or is_live(look):
             return
         for camera, address in _addresses(look).items():

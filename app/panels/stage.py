@@ -112,11 +112,26 @@ def head_html(look: Look, desk: Desk, clicks: Clicks | None) -> str:
     if clicks is None:
         return markup.div("ug-head", markup.div("ug-names", name + below) + state)
     back = clicks.label("home", desk.go_home, "‹", "ug-back", "All scans")
+    undo = f"Undo: {scan.undo}" if scan.undo else "Nothing to undo"
     tools = [
-        clicks.label("undo", desk.undo, "↶ Undo", "ug-tool" if scan.undo else "ug-tool ug-off", f"Undo: {scan.undo}" if scan.undo else "Nothing to undo"),
-        clicks.label("part-moved", desk.part_moved, "⟳ Part moved", "ug-tool", "Take all pictures again"),
-        clicks.label("export", desk.export, "⤓ Export", "ug-tool", "Write the results to a folder, or download the cloud"),
-    ]  # fmt: skip
+        clicks.label(
+            "undo", desk.undo, "↶ Undo", "ug-tool" if scan.undo else "ug-tool ug-off", undo
+        ),
+        clicks.label(
+            "export",
+            desk.export,
+            "⤓ Export",
+            "ug-tool",
+            "Write the results to a folder, or download the cloud",
+        ),
+    ]
+    if look.captures:
+        tools.insert(
+            1,
+            clicks.label(
+                "part-moved", desk.part_moved, "⟳ Part moved", "ug-tool", "Take all pictures again"
+            ),
+        )
     head = markup.div("ug-head", back + markup.div("ug-names", name + below) + state)
     return head + markup.div("ug-tools", "".join(tools))
 
