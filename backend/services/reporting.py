@@ -1,5 +1,6 @@
 """What a scan is worth: points, times, and against the truth where the rig knows it."""
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from backend.devices.protocols import KnowsTruth, Rig
-from backend.domain.errors import RigBusyError
+from backend.domain.errors import UnglareError
 from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
 from backend.jobs.plan import PlannedStage
 from backend.numerics.scoring import DEFINITION, Score, Scores, Truth, score
@@ -17,6 +18,8 @@ from backend.stages.cloud import Cloud
 from backend.storage.codec import decode
 from backend.storage.repositories import Repositories
 from backend.storage.rows import GivenRow, RunRow
+
+log = logging.getLogger(__name__)
 
 DEFINITION_OF_FIGURES = DEFINITION
 """How completeness and error are counted, for the help of whatever shows them."""
@@ -128,8 +131,11 @@ def compare_with_truth(cloud: Cloud, truth: Truth) -> Scores | None:
 def rig_truth(
     context: Context, loaded: LoadedScan, reference: str, cameras: tuple[str, ...]
 ) -> Truth | None:
-    """Ask the scan's rig for the truth; None if it has no rig, the rig doesn't know, or it is busy otherwise."""
-    if loaded.row.rig == NO_RIG:
+    """Ask the scan's rig for the truth; None if the rig isn't a simulated one, doesn't know, or can't be asked.
+
+    Hardware is never opened for it: an old scan can be exported where its rig is long gone.
+    """
+    if loaded.row.rig == NO_RIG or not _was_simulated(loaded):
         return None
 
     def ask(rig: Rig) -> Truth | None:
@@ -137,8 +143,15 @@ def rig_truth(
 
     try:
         return context.rigs.use(loaded.row.rig, loaded.row.rig_options, ask)
-    except RigBusyError:
+    except UnglareError as error:
+        log.warning("No truth for scan %s: %s", loaded.row.id, error.sentence)
         return None
+
+
+def _was_simulated(loaded: LoadedScan) -> bool:
+    """Tell by what the rig said of itself when it captured."""
+    told = [p.run.device.get("rig", {}) for p in loaded.plan.stages if p.run]
+    return any(info.get("simulated", False) for info in told)
 
 
 def _scores(context: Context, loaded: LoadedScan, cloud: Cloud) -> Scores | None:
