@@ -48,7 +48,7 @@ def test_a_simulated_rig_that_is_gone_costs_the_truth_only(tmp_path, monkeypatch
 
 def test_points_between_pixels_have_no_score():
     cloud = make_cloud(10)
-    flat = np.tile(np.float32([0, 0, 700]), (1, 640, 1))
+    flat = np.tile(np.array([0, 0, 700], np.float32), (1, 640, 1))
     lit, part = np.ones((1, 640), bool), np.zeros((1, 640), np.int16)
     truth = Truth(
         flat.astype(np.float32), np.zeros_like(flat, np.float32), lit, ~lit, part, ("wall",)
