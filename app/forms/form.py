@@ -88,6 +88,9 @@ class Form:
     def _row(self, setting: Setting) -> _Row:
         mark = self._gui.add_html(markup.marker("ug-setting"))
         control = self._control(setting)
+        if setting.examples:
+            words = markup.esc(", ".join(setting.examples))
+            self._gui.add_html(markup.div("ug-setting-note ug-examples", f"e.g. {words}"))
         note = self._gui.add_html("", visible=False)
         row = _Row(
             setting, mark, control, note, SettingView(value=setting.default, source="default")

@@ -36,6 +36,8 @@ class Setting:
     low: float | None = None
     high: float | None = None
     advanced: bool = False
+    examples: tuple[str, ...] = ()
+    """What may be typed, where the schema says so."""
 
     @property
     def label(self) -> str:
@@ -95,6 +97,7 @@ def _setting(name: str, described: Mapping[str, Any], shared: Mapping[str, Any])
         low=_limit(items, "minimum", "exclusiveMinimum", +_EDGE),
         high=_limit(items, "maximum", "exclusiveMaximum", -_EDGE),
         advanced=bool(core.get("advanced")),
+        examples=tuple(str(e) for e in core.get("examples", ())),
     )
 
 

@@ -179,7 +179,7 @@ def _in_words(check: CheckView, value: float) -> str:
 def facts_html(stage: StageState) -> str:
     """Return the stage's numbers and texts."""
     rows = fact_rows(fields_of_kind(stage, "value"))
-    if stage.duration_s is not None:
+    if stage.duration_s is not None and stage.fields:
         rows.append(("Time taken", duration(stage.duration_s)))
     if stage.take > 1:
         rows.append(("Take", str(stage.take)))

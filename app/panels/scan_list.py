@@ -79,7 +79,7 @@ class ScanListPanel:
             f'<i class="{"ug-on" if i < scan.stages_done else ""}"></i>' for i in range(scan.stages)
         )
         inner = head + markup.div("ug-scan-facts", markup.esc(facts)) + markup.div(
-            "ug-scan-facts", markup.span("", markup.esc(f"{method} · {scan.rig}")) + f'<span class="ug-dots" style="--c:{colour}">{dots}</span>'
+            "ug-scan-facts", markup.span("", markup.esc(" · ".join(t for t in (method, scan.rig) if t))) + f'<span class="ug-dots" style="--c:{colour}">{dots}</span>'
         )  # fmt: skip
         if not self._desk.who.may_operate:
             return markup.div("ug-scan", inner)

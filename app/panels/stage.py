@@ -181,7 +181,7 @@ def status_html(look: Look) -> str:
     inner = (
         title
         + markup.div("ug-sentence", markup.esc(_sentence(look, stage)))
-        + ("" if stage.fields else doc)
+        + ("" if stage.stage_run else doc)
     )
     return f'<div class="ug-status" style="--c:{colour}">{inner}{_progress(look, stage)}</div>'
 
