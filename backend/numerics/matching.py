@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, UInt16
 
 from backend.numerics.errors import MatchingError
-from backend.numerics.kernels import kernel, row_loop
+from backend.numerics.kernels import kernel, kernel_input, row_loop
 from backend.numerics.lattice import lattice_row
 from backend.numerics.reasons import Reason
 from backend.numerics.rectification import Canvas, Rectification
@@ -100,6 +100,7 @@ def match(
     Memory: two indices of rows times projector columns, one map of the other canvas.
     """
     _check(reference_px, other_px, rectification)
+    reference_px, other_px = kernel_input(reference_px), kernel_input(other_px)
     step = _median_step(reference_px, other_px)
     jump = settings.jump_px if settings.jump_px is not None else _JUMP_STEPS * step
     grid = _grid(other_px, step, rectification.other.width_px)
@@ -116,8 +117,8 @@ def match(
     _match_rows(
         reference_px,
         other_px,
-        unknown if sigma_reference_px is None else sigma_reference_px,
-        unknown if sigma_other_px is None else sigma_other_px,
+        unknown if sigma_reference_px is None else kernel_input(sigma_reference_px),
+        unknown if sigma_other_px is None else kernel_input(sigma_other_px),
         rectification.rectified_of_reference.nodes,
         pixel_of_other,
         np.array(rectification.other[:2], np.float64),
@@ -149,7 +150,7 @@ def sample_partner(
     """
     out = np.empty(matches.x_other_px.shape, np.float32)
     _sample_rows(
-        values,
+        kernel_input(values),
         matches.x_other_px,
         rectification.rectified_of_reference.nodes,
         rectification.pixel_of_other.map(),

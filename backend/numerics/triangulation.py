@@ -14,7 +14,7 @@ from backend.numerics.camera_model import (
     ray_lattice,
 )
 from backend.numerics.errors import CalibrationError
-from backend.numerics.kernels import kernel, row_loop
+from backend.numerics.kernels import kernel, kernel_input, row_loop
 from backend.numerics.lattice import lattice_row
 from backend.numerics.matching import Matches
 from backend.numerics.rectification import Rectification
@@ -119,8 +119,8 @@ def triangulate_projector(
     coefficients = _coefficients(projector, rows=rows)
     unknown = np.full((1, projector_px.shape[1]), np.nan, np.float32)
     _plane_rows(
-        projector_px,
-        unknown if sigma_projector_px is None else sigma_projector_px,
+        kernel_input(projector_px),
+        unknown if sigma_projector_px is None else kernel_input(sigma_projector_px),
         lattice.nodes,
         _plane_coefficients(coefficients, projector_from_camera),
         projector_from_camera.R.astype(np.float64),
@@ -171,8 +171,8 @@ def projector_consistency(
     check_transform(projector_from_points, "the projector")
     out = np.empty(projector_px.shape, np.float32)
     _residual_rows(
-        np.ascontiguousarray(points_mm),
-        projector_px,
+        kernel_input(points_mm),
+        kernel_input(projector_px),
         projector_from_points.R.astype(np.float64),
         projector_from_points.t_mm.astype(np.float64),
         _coefficients(projector, rows=rows),

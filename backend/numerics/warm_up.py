@@ -7,6 +7,7 @@ MODULES = (
     "backend.numerics.phasors",
     "backend.numerics.gray_code",
     "backend.numerics.warm_up_geometry",
+    "backend.numerics.gathering",
 )
 """Modules with kernels: each has a function `warm_up_kernels()` that runs them on tiny arrays."""
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 
 from backend.domain.checks import Check, at_least, at_most
 from backend.domain.hints import Mask, Picture, Points, Scalar, Table, Value
@@ -89,17 +89,13 @@ def precise_enough(result: Cloud, params: Params) -> Check:
     )  # fmt: skip
 
 
-def colour_of(
-    brightness: Float32[np.ndarray, "h w"] | None, valid: Bool[np.ndarray, "h w"]
-) -> UInt8[np.ndarray, "n 3"]:
-    """Turn brightness into gray colours of the valid points.
+def colour_of(brightness: Float32[np.ndarray, "m"], count: int) -> UInt8[np.ndarray, "n 3"]:
+    """Turn the points' brightness into gray colours; all alike if it isn't known (no value at all).
 
     A square root over a percentile range: black and bright parts stay visible side by side.
     """
-    count = int(np.count_nonzero(valid))
-    if brightness is None:
+    if brightness.size == 0:
         return np.full((count, 3), NO_COLOUR, np.uint8)
-    values = brightness[valid]
-    top = float(np.percentile(values[::17], 99)) if values.size else 1.0
-    gray = np.sqrt(np.clip(values / max(top, 1e-9), 0.0, 1.0)) * 255.0
+    top = float(np.percentile(brightness[:: max(1, count // 100_000)], 99))
+    gray = np.sqrt(np.clip(brightness / np.float32(max(top, 1e-9)), 0.0, 1.0)) * np.float32(255.0)
     return np.repeat(gray.astype(np.uint8)[:, None], 3, axis=1)

@@ -239,7 +239,7 @@ def _cloud(codes: Codes, rig: _Pair, pixels: _PixelPoints, points: _Points) -> C
     return Cloud(
         points_mm=points.points_mm[order].astype(np.float32),
         normals=np.nan_to_num(points.normals[order]),
-        colour=colour_of(brightness[None, :], np.ones((1, order.size), bool)),
+        colour=colour_of(brightness, order.size),
         sigma_mm=sigma_mm,
         pixel_x=points.camera_px[order, 0].astype(np.float32),
         pixel_y=points.camera_px[order, 1].astype(np.float32),

@@ -18,6 +18,7 @@ from backend.numerics.camera_model import Pinhole, RigidTransform
 from backend.numerics.confirmation import confirmed
 from backend.numerics.drift import smooth_drift
 from backend.numerics.filters import Kept
+from backend.numerics.gathering import gather
 from backend.numerics.matching import MatchSettings, match
 from backend.numerics.normals import normals
 from backend.numerics.reasons import Reason
@@ -365,32 +366,37 @@ class _Scene:
         self, raw: _Raw, rows: tuple[FilterRow, ...], brightness: Float32[np.ndarray, "h w"] | None
     ) -> Cloud:
         """Gather the points that are left."""
-        valid = filters.valid_points(raw.points_mm)
-        if not valid.any():
+        points = gather(
+            raw.points_mm,
+            normals(raw.points_mm, self.camera),
+            raw.sigma_mm,
+            self.phase.exposure_index[self.name],
+            brightness,
+        )
+        count = len(points.points_mm)
+        if count == 0:
             raise StageFailedError(
                 "No point is left: look at why pixels are missing, and loosen the filter or limit that removes most."
             )
-        y, x = np.nonzero(valid)
         decoded = int(np.count_nonzero(self.phase.reasons[self.name] == 0))
-        sigma = raw.sigma_mm[valid]
         return Cloud(
-            points_mm=raw.points_mm[valid],
-            normals=np.nan_to_num(normals(raw.points_mm, self.camera)[valid]),
-            colour=colour_of(brightness, valid),
-            sigma_mm=sigma,
-            pixel_x=x.astype(np.float32),
-            pixel_y=y.astype(np.float32),
-            exposure_index=self.phase.exposure_index[self.name][valid],
+            points_mm=points.points_mm,
+            normals=points.normals,
+            colour=colour_of(points.brightness, count),
+            sigma_mm=points.sigma_mm,
+            pixel_x=points.pixel_x,
+            pixel_y=points.pixel_y,
+            exposure_index=points.exposure_index,
             depth_mm={self.name: np.ascontiguousarray(raw.points_mm[..., 2])},
             reasons={self.name: raw.reasons},
             removed=rows,
-            point_count=int(np.count_nonzero(valid)),
-            median_sigma_mm=float(np.median(sigma)),
-            kept_share=int(np.count_nonzero(valid)) / max(decoded, 1),
+            point_count=count,
+            median_sigma_mm=float(np.median(points.sigma_mm[:: max(1, count // 100_000)])),
+            kept_share=count / max(decoded, 1),
+            cameras=(self.name,) if self.other is None else (self.name, self.other),
             consistency_px=raw.consistency_px,
             speck_px=self.speck_px,
             residual_max_cycles=self.residual_max_cycles,
-            cameras=(self.name,) if self.other is None else (self.name, self.other),
         )
 
 
