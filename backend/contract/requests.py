@@ -14,7 +14,7 @@ class CreateScan(Message):
     method: str
     rig: str = "simulated"
     rig_options: dict[str, Any] = {}
-    """What the rig's factory takes, e.g. `{"scene": "high-contrast", "width_px": 1280}`."""
+    """What the rig's factory takes, e.g. `{"scene": "high-contrast", "size": "1280x960"}`."""
     name: str = Field("", max_length=200)
     note: str = Field("", max_length=5000)
     preset: str | None = None

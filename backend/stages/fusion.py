@@ -86,11 +86,6 @@ class Phasors:
         Mapping[str, Float32[np.ndarray, "_h _w"]],
         Picture("Fused picture", unit="gray/ms", colormap="gray"),
     ]
-    modulation_gray: Annotated[
-        Mapping[str, Float32[np.ndarray, "_h _w"]],
-        Picture("Modulation", unit="gray", colormap="viridis"),
-    ]
-    """Amplitude of the first frequency, in gray levels of the pixel's dominating exposure."""
     reasons: Annotated[
         Mapping[str, UInt16[np.ndarray, "_h _w"]], Mask("Missing because", REASON_LABELS, bits=True)
     ]
@@ -217,9 +212,6 @@ def _summarise(sets: tuple[AxisPhasors, ...], exposures_ms: tuple[float, ...]) -
         fused={
             n: np.maximum(s.mean_gray[0] - np.float32(s.black_gray), 0) / times[s.exposure_index]
             for n, s in first.items()
-        },
-        modulation_gray={
-            n: np.hypot(s.in_phase_gray[0], s.quadrature_gray[0]) for n, s in first.items()
         },
         reasons={n: s.reasons for n, s in first.items()},
         served_share=served / pixels,

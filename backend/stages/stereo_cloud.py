@@ -356,10 +356,11 @@ class _Scene:
 
     def apply(self, title: str, reason: Reason, keep: _Filter, raw: _Raw) -> FilterRow:
         """Apply one filter: remove its points and note why."""
-        before = filters.valid_points(raw.points_mm)
         kept = keep(raw)
-        raw.reasons[before & ~kept.keep] |= np.uint16(reason)
-        filters.remove(raw.points_mm, kept)
+        if kept.removed:
+            y, x = np.nonzero(filters.valid_points(raw.points_mm) & ~kept.keep)
+            raw.reasons[y, x] |= np.uint16(reason)
+            raw.points_mm[y, x] = np.nan
         return FilterRow(title, kept.removed)
 
     def cloud(

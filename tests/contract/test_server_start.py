@@ -58,7 +58,7 @@ def server(folder: Path, **settings: str) -> Iterator[tuple[subprocess.Popen[str
 
 def test_it_serves_with_the_printed_token_and_ends_when_told(tmp_path: Path) -> None:
     with server(tmp_path) as (process, address, token):
-        with httpx.Client(base_url=address, trust_env=False) as client:
+        with httpx.Client(base_url=address, trust_env=False, timeout=60) as client:
             me = client.get("/api/me", headers={"Authorization": f"Bearer {token}"}).json()
             status = client.get("/api/health").status_code
         process.send_signal(signal.SIGTERM)
@@ -92,7 +92,9 @@ def test_what_a_killed_server_left_running_is_interrupted(tmp_path: Path) -> Non
 
     with server(tmp_path) as (_, address, token):
         headers = {"Authorization": f"Bearer {token}"}
-        state = httpx.get(f"{address}/api/scans/{scan}", headers=headers, trust_env=False).json()
+        state = httpx.get(
+            f"{address}/api/scans/{scan}", headers=headers, trust_env=False, timeout=60
+        ).json()
 
     assert state["job"]["status"] == "interrupted"
     assert "run again to go on" in state["job"]["error"]
