@@ -95,7 +95,11 @@ class Space:
 
     def view_part(self, middle: Array, radius: float) -> None:
         """Look at the part alone, from above and in front."""
-        self._look(middle, 1.02 * radius, np.deg2rad(58.0))
+        elevation = np.deg2rad(58.0)
+        # Up in the picture: the small panel lies below, and takes more room of a narrow one.
+        is_narrow = (self.client.camera.aspect or 1.0) < 1.0
+        down = np.array([0.0, -np.sin(elevation), -np.cos(elevation)])
+        self._look(middle + (0.28 if is_narrow else 0.12) * radius * down, 1.02 * radius, elevation)
 
     def view_top(self, middle: Array, radius: float) -> None:
         """Look down on the part, as the cameras do."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import viser
@@ -30,6 +30,8 @@ class _Row:
     note: viser.GuiHtmlHandle
     view: SettingView
     error: str | None = None
+    typed: list[Any] = field(default_factory=list)
+    """Values typed since the last one that was applied."""
 
 
 class Form:
@@ -71,7 +73,10 @@ class Form:
             if name in views:
                 row.view = views[name]
             value = draft.get(name, row.view.value)
-            if row.error is None:
+            if name not in draft:
+                row.typed.clear()
+            # What was typed here stands here already; writing it back would get between two keystrokes.
+            if row.error is None and value not in row.typed:
                 self._put(row, value)
             self._explain(row, drafted=name in draft)
 
@@ -133,6 +138,7 @@ class Form:
             row.error = str(error)
         else:
             row.error = None
+            row.typed.append(value)
             self._on_edit(row.setting.name, value)
         self._on_error(row.setting.name, row.error)
 

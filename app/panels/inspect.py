@@ -24,6 +24,8 @@ _WIDTH = 10.0
 """Width of the picture in scene units."""
 _NODE = "/inspection"
 _PANEL_PX = (286, 316)
+_CROSS = (255, 64, 220)
+"""In none of the colour maps."""
 
 
 @dataclass(frozen=True)
@@ -208,8 +210,8 @@ class Inspector:
         cross = self._space.scene.add_line_segments(
             f"{_NODE}/cross",
             np.array(lines),
-            (255, 214, 10),
-            thickness=1.6,
+            _CROSS,
+            thickness=2.0,
             thickness_units="screen",
         )
         self._nodes = [n for n in self._nodes if n.name != cross.name] + [cross]
