@@ -99,7 +99,7 @@ class Exposures:
     exposures_ms: tuple[float, ...]
     """Increasing."""
     table: Annotated[tuple[ExposureRow, ...], Table("Exposures", edits="exposures_ms")]
-    coverage: Annotated[float, Value("Predicted coverage")]
+    covered_share: Annotated[float, Value("Predicted coverage")]
     """Share of the lit pixels whose phase will be usable."""
     saturated_share: Annotated[float, Value("Predicted saturation")]
     phase_sigma_rad: Annotated[float, Value("Predicted phase noise, median", unit="rad")]
@@ -124,8 +124,8 @@ class Exposures:
 
 def _covered(result: Exposures, params: ExposuresParams) -> Check:
     return at_least(
-        "coverage", result.coverage, warning=0.95, failure=0.02,
-        sentence=f"{result.coverage:.1%} of the lit pixels are predicted to be measurable",
+        "coverage", result.covered_share, warning=0.95, failure=0.02,
+        sentence=f"{result.covered_share:.1%} of the lit pixels are predicted to be measurable",
     )  # fmt: skip
 
 
@@ -154,7 +154,7 @@ def exposures(
             ExposureRow(float(t), share, float(w))
             for t, share, w in zip(prediction.exposures_ms, shares, np.sort(wanted_ms), strict=True)
         ),
-        coverage=prediction.coverage,
+        covered_share=prediction.coverage,
         saturated_share=prediction.saturated,
         phase_sigma_rad=prediction.phase_sigma_median_rad,
         time_s=prediction.time_s,

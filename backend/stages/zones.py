@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
@@ -65,7 +66,10 @@ class Zones:
     """zones + 1 borders: first and last foreground gray at the ends."""
     table: Annotated[tuple[ZoneRow, ...], Table("Zones")]
     zone_count: Annotated[int, Value("Zones")]
-    zone_map: Annotated[Mapping[str, UInt8[np.ndarray, "_h _w"]], Mask("Zone of each pixel")]
+    zone_names: tuple[str, ...]
+    zone_map: Annotated[
+        Mapping[str, UInt8[np.ndarray, "_h _w"]], Mask("Zone of each pixel", names="zone_names")
+    ]
     """1 = darkest zone ..., 0 = background."""
 
 
@@ -88,6 +92,10 @@ def zones(preview: Preview, params: ZonesParams) -> Zones:
         valleys_gray=fitted.valleys_gray,
         table=tuple(_row(fitted, i) for i in range(len(fitted.peaks_gray))),
         zone_count=len(fitted.peaks_gray),
+        zone_names=tuple(
+            f"zone {i}: {low:.0f} to {high:.0f} gray"
+            for i, (low, high) in enumerate(pairwise(fitted.valleys_gray), start=1)
+        ),
         zone_map={
             name: zone_of_pixels(white, fitted.valleys_gray, preview.foreground[name])
             for name, white in preview.white.items()
