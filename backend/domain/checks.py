@@ -24,9 +24,21 @@ CheckFunction = Callable[[Any, Any], Check]
 
 
 def at_least(
-    name: str, value: float, *, warning: float, failure: float, sentence: str, unit: str = ""
+    name: str,
+    value: float,
+    *,
+    warning: float,
+    failure: float,
+    sentence: str,
+    unit: str = "",
+    remedy: str = "",
 ) -> Check:
-    """Grade a value that should be large: below `failure` it fails, below `warning` it warns."""
+    """Grade a value that should be large: below `failure` it fails, below `warning` it warns.
+
+    `remedy` says what to do; it follows the sentence where the value is too small.
+    """
+    if remedy and value < warning:
+        sentence = f"{sentence}: {remedy}"
     level = Level.FAILURE if value < failure else Level.WARNING if value < warning else Level.OK
     return Check(
         name, level, sentence, float(value), failure if level is Level.FAILURE else warning, unit

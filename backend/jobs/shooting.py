@@ -80,7 +80,8 @@ class Shooter:
         DeviceError
             If the shot failed for good; nothing of it is returned.
         """
-        settings = CameraSettings(exposure_us=exposure_ms * 1000.0, gain_db=gain_db)
+        # To the nanosecond: 240 periods of 1000/120 ms are 2000000.0000000002 us, beyond a limit of 2 s.
+        settings = CameraSettings(exposure_us=round(exposure_ms * 1000.0, 3), gain_db=gain_db)
         for attempt in range(1, ATTEMPTS + 1):
             self._control.check()
             try:

@@ -77,6 +77,7 @@ def enough_points(result: Cloud, params: Params) -> Check:
     return at_least(
         "points", result.point_count, warning=1000, failure=1,
         sentence=f"{result.point_count:,} points".replace(",", " "),
+        remedy="look at why pixels are missing, then loosen that limit or change the exposures",
     )  # fmt: skip
 
 

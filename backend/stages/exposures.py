@@ -13,6 +13,7 @@ from backend.domain.params import Params, setting
 from backend.domain.rig import CameraFacts, RigFacts
 from backend.domain.stage import stage
 from backend.domain.states import Level, Review
+from backend.numerics.fringe_orders import maximum_likelihood
 from backend.numerics.planning import (
     CameraNoise,
     ExposureGrid,
@@ -126,6 +127,7 @@ def _covered(result: Exposures, params: ExposuresParams) -> Check:
     return at_least(
         "coverage", result.covered_share, warning=0.95, failure=0.02,
         sentence=f"{result.covered_share:.1%} of the lit pixels are predicted to be measurable",
+        remedy="open the aperture, allow more time, or raise the camera's gain",
     )  # fmt: skip
 
 
@@ -171,6 +173,7 @@ def _design(params: ExposuresParams) -> FringeDesign:
         raise StageFailedError(
             f"The fringes' darkest code {params.low_gray:g} isn't below the brightest {params.high_gray:g}: lower it."
         )
+    _check_unwrapping(params)
     return FringeDesign(
         periods=params.periods,
         steps=params.steps,
@@ -179,6 +182,12 @@ def _design(params: ExposuresParams) -> FringeDesign:
         directions=params.directions,
         aid=params.aid,
     )
+
+
+def _check_unwrapping(params: ExposuresParams) -> None:
+    """Refuse frequencies that can't be told apart before anything is captured with them."""
+    if params.aid == "none" and min(params.periods) > 1.0:
+        maximum_likelihood(params.periods)
 
 
 class _Planner:

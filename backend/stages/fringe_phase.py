@@ -98,6 +98,7 @@ def _enough(result: AbsolutePhase, params: FringePhaseParams) -> Check:
     return at_least(
         "valid share", result.valid_share, warning=0.02, failure=1e-4,
         sentence=f"{result.valid_share:.1%} of all pixels have an absolute phase",
+        remedy="look at why pixels are missing, then change the exposures",
     )  # fmt: skip
 
 

@@ -85,13 +85,21 @@ def _lit(preview: Preview, params: Params) -> Check:
     return at_least(
         "lit share", preview.foreground_share, warning=0.02, failure=0.001,
         sentence=f"{preview.foreground_share:.1%} of the picture is lit by the projector",
+        remedy="move the part into the light, open the aperture or expose longer",
     )  # fmt: skip
+
+
+def _saturation_sentence(preview: Preview, params: PreExposureParams) -> str:
+    fact = f"{preview.saturated_share:.2%} of the lit pixels are saturated at {preview.t_pre_ms:.1f} ms"
+    if preview.saturated_share <= params.saturated_share:
+        return fact
+    return f"{fact}: shorten the exposure, close the aperture or dim the projector"
 
 
 def _unsaturated(preview: Preview, params: PreExposureParams) -> Check:
     return at_most(
         "saturation", preview.saturated_share, warning=params.saturated_share, failure=0.2,
-        sentence=f"{preview.saturated_share:.2%} of the lit pixels are saturated at {preview.t_pre_ms:.1f} ms",
+        sentence=_saturation_sentence(preview, params),
     )  # fmt: skip
 
 
