@@ -45,6 +45,9 @@ class Desk(Protocol):
     def set_draft_error(self, name: str, error: str | None) -> None:
         """Note that what was typed for a setting can't be read; None: it can."""
 
+    def forget_draft_errors(self) -> None:
+        """Forget what couldn't be read: the controls that said it are gone."""
+
     def set_reason(self, reason: str) -> None:
         """Keep the words that go into the log with the next edit or decision."""
 

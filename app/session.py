@@ -143,6 +143,10 @@ class Session:
         self._draft_errors = others | ({name: error} if error else {})
         self.act(self._draw_controls, key="controls")
 
+    def forget_draft_errors(self) -> None:
+        """Forget what couldn't be read: the controls that said it are gone."""
+        self._draft_errors = {}
+
     def set_reason(self, reason: str) -> None:
         """Keep the words that go into the log with the next edit or decision."""
         self._reason = reason

@@ -31,6 +31,7 @@ class SettingsPanel:
 
     def _make(self, look: Look) -> None:
         old, self._folder, self._form = self._folder, None, None
+        self._desk.forget_draft_errors()
         settings = read_schema(look.description.settings) if look.description else ()
         if settings:
             with self._place:

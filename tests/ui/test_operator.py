@@ -142,8 +142,14 @@ def test_what_can_t_be_read_is_said_and_not_sent(
     desk.control("Histogram smoothing").fill("9")
     desk.button("Apply").click()
     expect(desk.page.locator(".mantine-Notification-root").last).to_contain_text("not a number")
-
     assert wishes(served, scan, "edit zones") == []
+
+    # What couldn't be read is gone with its control; what could be read is kept.
+    desk.select("Preview").select("Zones")
+    expect(desk.control("Histogram smoothing")).to_have_value("9")
+    desk.button("Apply").click()
+    expect(desk.page.locator(".ug-setting-note")).to_contain_text("edited")
+    assert [e.changes for e in wishes(served, scan, "edit zones")] == [{"sigma_gray": 9.0}]
 
 
 def test_the_server_s_refusal_is_shown_in_its_words(
