@@ -16,7 +16,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from backend.contract.events import Event, FrameCaptured, JobProgress, ScanChanged
 from backend.devices.protocols import Frame as DeviceFrame
-from backend.devices.protocols import Rig
+from backend.devices.protocols import KnowsTruth, Rig
 from backend.domain.errors import CancelledError, UnglareError
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.stage import Stage
@@ -400,4 +400,6 @@ def _devices(rig: Rig) -> dict[str, Any]:
     """Return who every device of a rig is, to be stored with what it captured."""
     devices = {"rig": rig.info, "projector": rig.projector.info}
     cameras = {name: camera.info for name, camera in rig.cameras.items()}
-    return {name: asdict(info) for name, info in (devices | cameras).items()}
+    told = {name: asdict(info) for name, info in (devices | cameras).items()}
+    told["rig"]["knows_truth"] = isinstance(rig, KnowsTruth)
+    return told

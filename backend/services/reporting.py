@@ -131,11 +131,11 @@ def compare_with_truth(cloud: Cloud, truth: Truth) -> Scores | None:
 def rig_truth(
     context: Context, loaded: LoadedScan, reference: str, cameras: tuple[str, ...]
 ) -> Truth | None:
-    """Ask the scan's rig for the truth; None if the rig isn't a simulated one, doesn't know, or can't be asked.
+    """Ask the scan's rig for the truth; None if the rig didn't know it when it captured, or can't be asked now.
 
     Hardware is never opened for it: an old scan can be exported where its rig is long gone.
     """
-    if loaded.row.rig == NO_RIG or not _was_simulated(loaded):
+    if loaded.row.rig == NO_RIG or not _knew_truth(loaded):
         return None
 
     def ask(rig: Rig) -> Truth | None:
@@ -148,10 +148,10 @@ def rig_truth(
         return None
 
 
-def _was_simulated(loaded: LoadedScan) -> bool:
-    """Tell by what the rig said of itself when it captured."""
+def _knew_truth(loaded: LoadedScan) -> bool:
+    """Tell by what was noted of the rig when it captured."""
     told = [p.run.device.get("rig", {}) for p in loaded.plan.stages if p.run]
-    return any(info.get("simulated", False) for info in told)
+    return any(info.get("knows_truth", False) for info in told)
 
 
 def _scores(context: Context, loaded: LoadedScan, cloud: Cloud) -> Scores | None:

@@ -15,7 +15,18 @@ class SimulatedRigConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    scene: str = "high-contrast"
+    scene: str = Field(
+        "high-contrast",
+        examples=[
+            "high-contrast",
+            "metal",
+            "workpieces",
+            "sprayed:workpieces",
+            "plane",
+            "sphere",
+            "step",
+        ],
+    )
     """Name of a scene, `sprayed:NAME` for the same geometry in matte white, or `mesh:FILE[?TABLE]`."""
     cameras: int = Field(2, ge=1, le=2)
     """2: left and right; 1: the left one only, with the projector."""
