@@ -22,11 +22,13 @@ help:
 	@echo "make bench   run the benchmarks"
 	@echo "make lock    write the lock files after a change in pyproject.toml (OPTIONS=--upgrade: newest versions)"
 
-demo: $(VENV)/.system-run $(ENVIRONMENT)
+demo: $(VENV)/.system-run $(ENVIRONMENT) $(VENV)/.kernels
 	$(BIN)/unglare demo $(OPTIONS)
 
-test: $(VENV)/.system-run $(VENV)/.system-test $(VENV)/.python-dev
-	$(BIN)/pytest --numprocesses=$(JOBS) --doctest-modules tests backend/domain backend/numerics $(OPTIONS)
+# The browser's tests run by themselves: its pictures are drawn by the processor, which others would keep busy.
+test: $(VENV)/.system-run $(VENV)/.system-test $(VENV)/.python-dev $(VENV)/.kernels
+	$(BIN)/pytest -m "not bench and not ui" --numprocesses=$(JOBS) --doctest-modules tests backend/domain backend/numerics $(OPTIONS)
+	$(BIN)/pytest -m ui tests/ui $(OPTIONS)
 
 lint: $(VENV)/.python-dev
 	$(BIN)/ruff check .
@@ -53,6 +55,11 @@ lock:
 $(VENV)/.system-%: docker/packages-%.txt docker/install-system-packages.sh
 	docker/install-system-packages.sh $*
 	@mkdir -p $(VENV) && touch $@
+
+# Compiled once, so that neither the first scan nor each test process waits for it.
+$(VENV)/.kernels: $(ENVIRONMENT) $(wildcard backend/numerics/*.py)
+	$(BIN)/python -c "from backend.numerics.warm_up import warm_up; warm_up()"
+	@touch $@
 
 $(VENV)/.python-run: requirements.lock pyproject.toml docker/install-python-packages.sh
 	PYTHON="$(PYTHON)" docker/install-python-packages.sh requirements.lock $(VENV) --editable
