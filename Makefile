@@ -57,7 +57,8 @@ $(VENV)/.system-%: docker/packages-%.txt docker/install-system-packages.sh
 	@mkdir -p $(VENV) && touch $@
 
 # Compiled once, so that neither the first scan nor each test process waits for it.
-$(VENV)/.kernels: $(ENVIRONMENT) $(wildcard backend/numerics/*.py)
+# After the environment: targets name it before this one, and nothing runs in parallel.
+$(VENV)/.kernels: $(wildcard backend/numerics/*.py)
 	$(BIN)/python -c "from backend.numerics.warm_up import warm_up; warm_up()"
 	@touch $@
 
