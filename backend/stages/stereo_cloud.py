@@ -358,9 +358,7 @@ class _Scene:
         """Apply one filter: remove its points and note why."""
         kept = keep(raw)
         if kept.removed:
-            y, x = np.nonzero(filters.valid_points(raw.points_mm) & ~kept.keep)
-            raw.reasons[y, x] |= np.uint16(reason)
-            raw.points_mm[y, x] = np.nan
+            raw.reasons[filters.remove(raw.points_mm, kept)] |= np.uint16(reason)
         return FilterRow(title, kept.removed)
 
     def cloud(
