@@ -44,11 +44,26 @@ class Picture(Hint):
     low: float | None = None
     """Value at the lower end of the colours; None: the 1 % percentile."""
     high: float | None = None
+    x: str | None = None
+    """Field with the value of each column, where the picture is a function of two settings."""
+    y: str | None = None
+    """Field with the value of each row."""
+    point: str | None = None
+    """Field with the (x, y) that was chosen, drawn as a marker."""
+    edits: str | None = None
+    """Setting that takes a point picked in the picture (with `point`), or a painted picture (without)."""
 
 
 @dataclass(frozen=True)
 class Frames(Hint):
     """Captured frames: one picture out of a list, chosen by camera, exposure and pattern."""
+
+    x: str | None = None
+    """Field with a number per frame of each camera: a pixel that is clicked shows its gray levels over it."""
+    slope: str | None = None
+    """Field, a map per camera, with the slope of the line fitted to each pixel."""
+    offset: str | None = None
+    """Field, a map per camera, with the offset of that line."""
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,20 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class ScreenModel:
+    """A display as a measured surface: where points of the pattern lie, in the screen's own frame.
+
+    Four corners describe a flat screen; between points the surface is interpolated.
+    Frame: +X to the right and +Y down on the screen as its viewer sees it, +Z away from the viewer, in mm.
+    """
+
+    shares: Float[np.ndarray, "n 2"]
+    """Position in the pattern, x and y in [0, 1], of every known point."""
+    points_mm: Float[np.ndarray, "n 3"]
+    """The same points on the surface."""
+
+
+@dataclass(frozen=True)
 class RigCalibration:
     """Where the rig's devices are and how they see; whatever of it the rig has.
 
@@ -41,6 +55,11 @@ class RigCalibration:
     """Name of the reference camera: one point per pixel of this camera."""
     projector: PinholeModel | None = None
     projector_from_world: Pose | None = None
+    screen: ScreenModel | None = None
+    """The display of a rig that looks at its screen through the part."""
+    screen_from_world: Pose | None = None
+    mirror_from_world: Pose | None = None
+    """Frame of the mirror under test: origin at its middle, +X right and +Y up as seen from its front, +Z towards the viewer."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,19 @@ from backend.domain.hints import Hint
 from backend.domain.stage import Stage, shown_fields
 from backend.storage.artifacts import ArtifactStore
 
-_SIBLINGS = ("x", "fit", "valleys", "peaks", "normals", "colour", "faces")
+_SIBLINGS = (
+    "x",
+    "y",
+    "point",
+    "slope",
+    "offset",
+    "fit",
+    "valleys",
+    "peaks",
+    "normals",
+    "colour",
+    "faces",
+)
 """Attributes of hints that name another field of the same result."""
 
 
