@@ -1,0 +1,16 @@
+"""Fringe reflection: mirrors measured by what they show of a screen, through an optimised camera response.
+
+Source: "Precise phase measurement for fringe reflection technique through optimized camera response",
+Sensors 23(23), 9299 (2023), doi:10.3390/s23239299.
+"""
+
+from backend.domain.method import Method
+from backend.domain.rig import RigCalibration, RigFacts
+
+METHOD = Method(
+    name="fringe-reflection",
+    title="Fringe reflection",
+    doc="Measures mirrors: fringes on a screen, seen through the part, tell the slope of every point.",
+    stages=(),
+    given=(RigFacts, RigCalibration),
+)
