@@ -130,5 +130,7 @@ class ScanFile(_Part):
     """Who the devices are that captured, by their names in the rig."""
     metrics: dict[str, Any]
     """Points, times and, where the rig knew it, the comparison with the truth."""
+    arrays: dict[str, str] = {}
+    """Files of the arrays that settings refer to, e.g. painted masks, by the hash in the setting."""
     files: dict[str, str]
     """sha256 of every other file of the export."""

@@ -7,7 +7,8 @@ def zones(preview: Preview, params: ZonesParams) -> Zones:
 ```
 
 A parameter named `params` holds the settings, one annotated `Shoot` makes the stage capture, one annotated
-`Progress` lets it report; all others are inputs, `X | None` optional ones. The result is a frozen dataclass
+`Progress` lets it report, one annotated `LoadArray` lets it read the arrays that its settings refer to
+(`ArrayHash`); all others are inputs, `X | None` optional ones. The result is a frozen dataclass
 whose fields say by `Annotated[..., Hint]` how they want to be looked at.
 """
 
@@ -19,7 +20,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from backend.domain.arrays import LoadArray
 from backend.domain.checks import Check, CheckFunction
+from backend.domain.errors import NotFoundError
 from backend.domain.hints import Hint
 from backend.domain.params import Params
 from backend.domain.shots import Progress, Shoot
@@ -65,6 +68,7 @@ class Stage:
     captures: bool
     shoot_argument: str | None
     progress_argument: str | None
+    load_argument: str | None
     checks: tuple[CheckFunction, ...]
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -97,6 +101,7 @@ class Stage:
         *,
         shoot: Shoot | None = None,
         progress: Progress | None = None,
+        load: LoadArray | None = None,
     ) -> Any:
         """Call the function with everything its signature asks for, by name."""
         arguments: dict[str, Any] = {i.name: inputs.get(i.name) for i in self.inputs}
@@ -106,6 +111,8 @@ class Stage:
             arguments[self.shoot_argument] = shoot
         if self.progress_argument:
             arguments[self.progress_argument] = progress or _silent
+        if self.load_argument:
+            arguments[self.load_argument] = load or _no_arrays
         return self.function(**arguments)
 
     def check(self, result: Any, params: Params) -> tuple[Check, ...]:
@@ -208,6 +215,7 @@ def _read_signature(function: Callable[..., Any]) -> dict[str, Any]:
     params = hints.pop("params", NoParams)
     shoot = _take(hints, Shoot)
     progress = _take(hints, Progress)
+    load = _take(hints, LoadArray)
     return {
         "params": params,
         "inputs": tuple(_read_input(name, n, annotation) for n, annotation in hints.items()),
@@ -215,6 +223,7 @@ def _read_signature(function: Callable[..., Any]) -> dict[str, Any]:
         "captures": shoot is not None,
         "shoot_argument": shoot,
         "progress_argument": progress,
+        "load_argument": load,
     }
 
 
@@ -241,3 +250,8 @@ def _read_input(stage_name: str, name: str, annotation: Any) -> Input:
 
 def _silent(done: float, text: str = "") -> None:
     """Report to nobody."""
+
+
+def _no_arrays(array_hash: str) -> Any:
+    """Have no arrays: a stage that is called without a store."""
+    raise NotFoundError(f"There is no array {array_hash[:12]}: upload it, then set it again.")

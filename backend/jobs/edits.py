@@ -1,12 +1,17 @@
 """What the edits of a scan amount to: settings, takes, and what undo would take back. Pure."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from backend.domain.errors import InvalidSettingError
 from backend.domain.method import Method
 from backend.domain.stage import Stage
-from backend.jobs.stage_settings import StageSettings, check_values, require_stage
+from backend.jobs.stage_settings import (
+    StageSettings,
+    check_values,
+    require_arrays,
+    require_stage,
+)
 from backend.storage.rows import EditKind, EditRow
 
 TAKE = "take"
@@ -107,9 +112,19 @@ def preset_values(method: Method, preset: str | None) -> dict[str, dict[str, Any
 
 
 def check_recipe(
-    method: Method, preset: str | None, recipe: Mapping[str, Mapping[str, Any]]
+    method: Method,
+    preset: str | None,
+    recipe: Mapping[str, Mapping[str, Any]],
+    is_stored: Callable[[str], bool],
 ) -> dict[str, dict[str, Any]]:
     """Refuse a recipe that the method can't use; return it as its settings store it (`"3"` becomes 3.0).
+
+    Parameters
+    ----------
+    method, preset, recipe
+        What it is for, what it is laid over, and the recipe.
+    is_stored
+        Tells whether there is an array of a hash, that a setting may refer to.
 
     Raises
     ------
@@ -119,7 +134,9 @@ def check_recipe(
     base = preset_values(method, preset)
     checked: dict[str, dict[str, Any]] = {}
     for name, values in recipe.items():
-        params = check_values(require_stage(method, name), {**base.get(name, {}), **values})
+        stage = require_stage(method, name)
+        params = check_values(stage, {**base.get(name, {}), **values})
+        require_arrays(stage, params, is_stored)
         document = params.model_dump(mode="json")
         checked[name] = {field: document[field] for field in values}
     return checked

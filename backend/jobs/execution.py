@@ -263,6 +263,7 @@ class JobExecution:
                 planned.settings.params,
                 shoot=session.run_plan,
                 progress=self.control.progress,
+                load=shop.store.get,
             )
 
     def _seen(

@@ -1,11 +1,12 @@
 """Check settings against a stage's model, and say in one sentence what is allowed."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from pydantic import ValidationError
 
+from backend.domain.arrays import array_hashes
 from backend.domain.errors import InvalidSettingError
 from backend.domain.method import Method
 from backend.domain.params import Params
@@ -42,6 +43,22 @@ def check_values(stage: Stage, values: Mapping[str, Any]) -> Params:
         return stage.params.model_validate(dict(values))
     except ValidationError as error:
         raise InvalidSettingError(_sentence(stage, error)) from None
+
+
+def require_arrays(stage: Stage, params: Params, is_stored: Callable[[str], bool]) -> None:
+    """Refuse settings that refer to arrays which aren't in the store.
+
+    Raises
+    ------
+    InvalidSettingError
+        Naming stage, field and hash.
+    """
+    for field, array_hash in array_hashes(params):
+        if not is_stored(array_hash):
+            raise InvalidSettingError(
+                f"{stage.name}.{field} names the array {array_hash[:12]}..., which isn't stored here: "
+                "upload it first, then set it."
+            )
 
 
 def require_field(stage: Stage, field: str) -> None:

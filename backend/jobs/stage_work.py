@@ -69,7 +69,8 @@ def perform(
     stage = registry.get(task.method).stage(task.stage)
     params = stage.params.model_validate(task.settings)
     with stage_errors(stage):
-        result = stage.run(decode_inputs(stage, task.inputs, store), params, progress=progress)
+        inputs = decode_inputs(stage, task.inputs, store)
+        result = stage.run(inputs, params, progress=progress, load=store.get)
         return conclude(stage, result, params, store)
 
 

@@ -19,7 +19,7 @@ from backend.jobs.edits import (
     since,
 )
 from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
-from backend.jobs.stage_settings import check_values, require_field
+from backend.jobs.stage_settings import check_values, require_arrays, require_field
 from backend.services.context import Context
 from backend.services.states import scan_state
 from backend.services.telling import announce, refuse_running
@@ -49,7 +49,7 @@ def edit(context: Context, scan: str, stage: str, request: EditSettings, who: st
             require_field(target, name)
         known = [row for row in since(loaded.edits, request.revision) if row.stage == stage]
         _refuse_stale(loaded, [row for row in known if row.field in fields])
-        changes = _changes(loaded, target, request)
+        changes = _changes(context, loaded, target, request)
         if changes:
             _store(context, repositories, loaded, changes, reason=request.reason, who=who)
             _audit_edit(repositories, loaded, target, changes, request.reason, who)
@@ -148,12 +148,15 @@ class _Change:
     kind: EditKind
 
 
-def _changes(loaded: LoadedScan, stage: Stage, request: EditSettings) -> list[_Change]:
+def _changes(
+    context: Context, loaded: LoadedScan, stage: Stage, request: EditSettings
+) -> list[_Change]:
     """Find out what a request changes; settings are compared as they are stored, not as they are written."""
     edited = edited_values(loaded.edits).get(stage.name, {})
     base = _without_edits(loaded, stage)
     kept = {name: value for name, value in edited.items() if name not in request.reset}
     wanted = check_values(stage, _known(stage, base | kept | dict(request.changes)))
+    require_arrays(stage, wanted, context.store.__contains__)
     new = wanted.model_dump(mode="json")
     unedited = check_values(stage, _known(stage, base)).model_dump(mode="json")
     old = loaded.plan.stage(stage.name).settings.values

@@ -18,6 +18,7 @@ from backend.contract.scan_file import (
     WrittenStage,
 )
 from backend.contract.scans import ScanState, StageState
+from backend.domain.arrays import array_hashes
 from backend.domain.errors import ConflictError
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.shots import Progress
@@ -57,7 +58,7 @@ def export_scan(
     """Write a scan's present results into a folder and return its files.
 
     `scan.json` (how the scan came about, see `contract.scan_file`), `cloud.ply`,
-    `maps/<stage>.<field>[.<camera>].npy` for every shown map, and with `frames` the captured frames in the
+    `maps/<stage>.<field>[.<camera>].npy` for every shown map, `arrays/` for what settings refer to, and with `frames` the captured frames in the
     import format, so that importing the folder gives the same results again. The folder appears whole or not
     at all; an older export in its place is replaced.
 
@@ -84,7 +85,8 @@ def export_scan(
         given = {
             name: _written_given(target, content, name, context.store) for name in content.given
         }
-        document = content.scan_file(context, given, metrics, dict(target.hashes))
+        arrays = _write_arrays(target, content, context.store)
+        document = content.scan_file(context, given, metrics, arrays, dict(target.hashes))
         target.write_json(SCAN_FILE, document.model_dump(mode="json"))
         names = sorted(target.hashes)
     with context.database.transaction() as repositories:
@@ -166,6 +168,7 @@ class _Content:
         context: Context,
         given: dict[str, WrittenGiven],
         metrics: dict[str, Any],
+        arrays: dict[str, str],
         files: dict[str, str],
     ) -> ScanFile:
         """Write how the scan came about."""
@@ -195,6 +198,7 @@ class _Content:
             audit=tuple(_written_audit(a) for a in self.audit),
             devices={name: d for run in self.runs.values() for name, d in run.device.items()},
             metrics=metrics,
+            arrays=arrays,
             files=files,
         )
 
@@ -255,6 +259,17 @@ def _write_frames(
         given=content.given,
         progress=progress,
     )
+
+
+def _write_arrays(target: ExportFolder, content: _Content, store: ArtifactStore) -> dict[str, str]:
+    """Write the arrays that today's settings refer to."""
+    files: dict[str, str] = {}
+    for planned in content.loaded.plan.stages:
+        for _, array_hash in array_hashes(planned.settings.params):
+            files[array_hash] = f"arrays/{array_hash}.npy"
+    for array_hash, name in files.items():
+        target.write_array(name, store.get(array_hash))
+    return files
 
 
 def _written_given(

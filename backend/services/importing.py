@@ -73,7 +73,8 @@ class Importer:
         method = self.registry.get(folder.capture.method)
         plan = _ImportPlan(folder, method, read_scan_file(folder))
         calibration = plan.calibration()  # before hundreds of frames are read
-        recipe = plan.recipe()
+        plan.bring_arrays(self.store)
+        recipe = plan.recipe(self.store)
         stored = self._store_frames(plan, progress)
         scan = new_id()
         journal = self._journal(scan, stored, folder)
@@ -283,7 +284,15 @@ class _ImportPlan:
             return frame.stage
         return None
 
-    def recipe(self) -> dict[str, dict[str, Any]]:
+    def bring_arrays(self, store: ArtifactStore) -> None:
+        """Put the arrays that the export's settings refer to into the store."""
+        for array_hash, name in (self.scan_file.arrays if self.scan_file else {}).items():
+            if store.put(read_array(self.folder.folder, name)).hash != array_hash:
+                raise InvalidCaptureError(
+                    f"{name} isn't what was exported (its hash differs): export the scan again."
+                )
+
+    def recipe(self, store: ArtifactStore) -> dict[str, dict[str, Any]]:
         """Return the settings of the export that aren't today's defaults."""
         if self.scan_file is None:
             return {}
@@ -298,7 +307,7 @@ class _ImportPlan:
             }
             if values:
                 chosen[s.name] = values
-        return check_recipe(self.method, None, chosen)
+        return check_recipe(self.method, None, chosen, store.__contains__)
 
     def calibration(self) -> RigCalibration | None:
         """Return the folder's own calibration, where an export doesn't bring the exact one."""

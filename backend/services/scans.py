@@ -36,7 +36,7 @@ def create_scan(context: Context, request: CreateScan, who: str) -> ScanState:
     """
     method = context.registry.get(request.method)
     preset_values(method, request.preset)
-    recipe = check_recipe(method, request.preset, request.settings)
+    recipe = check_recipe(method, request.preset, request.settings, context.store.__contains__)
     asked, rig = _ask_rig(context, request)
     row = ScanRow(
         id=new_id(),

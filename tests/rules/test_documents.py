@@ -92,7 +92,7 @@ def test_settings_of_stages_in_examples_hold(readme: str) -> None:
     method = registry().get("hdr-fringe")
     for words in shell_lines(readme):
         given = [words[n + 1] for n, word in enumerate(words) if word == "--set"]
-        check_recipe(method, None, parse_settings(given))
+        check_recipe(method, None, parse_settings(given), lambda _: True)
 
 
 def test_the_stages_are_those_of_the_method(readme: str) -> None:

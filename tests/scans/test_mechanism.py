@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from backend.contract.requests import Decide, EditSettings, RedoStage, StartRun, UndoEdit
@@ -78,9 +79,10 @@ def test_a_cosmetic_edit_invalidates_nothing(house: House) -> None:
 
 def test_a_text_that_refers_to_an_artifact_is_a_setting_like_any_other(house: House) -> None:
     state = house.run_through(house.create().id)
-    state = house.edit(state, "toy_levels", mask="ab" * 32)
+    mask = house.shop.store.put(np.ones((16, 24), np.float32)).hash
+    state = house.edit(state, "toy_levels", mask=mask)
     assert statuses(state)["levels"] == "pending"
-    assert stage(state, "toy_levels").settings["mask"].value == "ab" * 32
+    assert stage(state, "toy_levels").settings["mask"].value == mask
 
 
 def test_equal_recomputation_stops_the_wave(house: House) -> None:

@@ -25,6 +25,7 @@ from backend.devices.protocols import (
     TriggerSource,
 )
 from backend.devices.protocols import Frame as DeviceFrame
+from backend.domain.arrays import ArrayHash, LoadArray
 from backend.domain.checks import Check, at_most
 from backend.domain.errors import RigFailedError, StageFailedError
 from backend.domain.frames import Frame
@@ -131,7 +132,7 @@ class LevelsParams(Params):
     )
     kind: Literal["even", "odd"] = setting("even", title="Kind")
     colour: str = setting("red", title="Colour", cosmetic=True)
-    mask: str | None = setting(None, title="Mask", max_length=64)
+    mask: ArrayHash | None = setting(None, title="Mask")
     most: float = setting(6.0, title="Most levels", ge=1, le=100)
 
 
@@ -156,10 +157,12 @@ def few_levels(result: Levels, params: LevelsParams) -> Check:
 
 
 @stage(title="Levels", version=1, review=Review.ON_WARNING, checks=(few_levels,))
-def toy_levels(look: Look, params: LevelsParams) -> Levels:
+def toy_levels(look: Look, params: LevelsParams, load: LoadArray) -> Levels:
     """Group the gray levels of the white field."""
     gray = next(iter(look.white.values()))
     coarse = gray // params.step_gray
+    if params.mask:
+        coarse = (coarse * load(params.mask)).astype(np.uint8)
     levels = np.unique(coarse) * float(params.step_gray)
     if params.levels_gray:
         levels = np.array(params.levels_gray)

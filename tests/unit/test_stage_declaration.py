@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
+from backend.domain.arrays import ArrayHash, LoadArray, array_hashes
 from backend.domain.checks import Check, at_least, at_most, worst
+from backend.domain.errors import NotFoundError
 from backend.domain.hints import Picture, Value
 from backend.domain.method import Method
 from backend.domain.params import Params, setting, without_cosmetics
@@ -65,6 +67,35 @@ def area(
 def width() -> Width:
     """Measure the width."""
     return Width(4.0)
+
+
+class PaintParams(Params):
+    """Settings that refer to arrays."""
+
+    paint: ArrayHash | None = setting(None, title="Paint")
+    layers: tuple[ArrayHash, ...] = setting((), title="Layers")
+    name: str = setting("cd" * 32, title="Name")
+
+
+@stage(title="Paint", version=1)
+def paint(params: PaintParams, load: LoadArray) -> Width:
+    """Measure what was painted."""
+    return Width(float(load(params.paint).sum()) if params.paint else 0.0)
+
+
+def test_arrays_are_loaded_by_whoever_runs_the_stage():
+    assert (paint.load_argument, paint.inputs) == ("load", ())
+    params = PaintParams(paint="ab" * 32)
+    assert paint.run({}, params, load=lambda array_hash: np.ones(3)) == Width(3.0)
+    with pytest.raises(NotFoundError, match="no array abababababab"):
+        paint.run({}, params)
+
+
+def test_settings_tell_which_arrays_they_refer_to():
+    params = PaintParams(paint="ab" * 32, layers=("01" * 32, "02" * 32))
+    assert list(array_hashes(params)) == [
+        ("paint", "ab" * 32), ("layers", "01" * 32), ("layers", "02" * 32),
+    ]  # fmt: skip
 
 
 def test_the_signature_is_read():
