@@ -18,6 +18,7 @@ from backend.cli.options import (
     Size,
     parse_rig_options,
     parse_settings,
+    with_uploads,
 )
 from backend.cli.output import Document, ProgressLines, answering, console, quiet_logging, table
 
@@ -77,6 +78,8 @@ def scan(
             progress.step("rig", 0.0, "opening")
             if resume:
                 end_dead_job(services, resume, data)
+            uploaded = with_uploads(services, method, request.settings)
+            request = request.model_copy(update={"settings": uploaded})
             chosen = resume or services.create_scan(request, who()).id
             run_and_export(services, chosen, answer, progress, out=out, frames=frames)
     if not as_json:
@@ -168,6 +171,8 @@ def show_summary(answer: Document) -> None:
     for name, figures in {"all": answer.get("truth"), **answer.get("parts", {})}.items():
         if figures:
             out.print(f"  {name}: {truth_words(figures)}")
+    if answer.get("computing_s") is not None:
+        out.print(f"own computing {answer['computing_s']:.1f} s, rig {answer['rig_s']:.1f} s")
     if answer["files"]:
         out.print(f"written to {Path(answer['files'][0]).parent}")
 
@@ -181,7 +186,9 @@ def truth_words(figures: dict[str, Any]) -> str:
 
     return (
         f"{number('completeness', '.3%', '')} complete, {number('outlier_share', '.3%', '')} outliers, "
-        f"rms {number('rms_mm', '.4f', ' mm')}, median {number('median_mm', '.4f', ' mm')}"
+        f"{number('over_exposed_share', '.3%', '')} over-exposed, rms {number('rms_mm', '.4f', ' mm')}, "
+        f"median {number('median_mm', '.4f', ' mm')}, mean {number('mean_mm', '.4f', ' mm')} "
+        f"± {number('std_mm', '.4f', ' mm')}"
     )
 
 

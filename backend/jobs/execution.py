@@ -234,7 +234,8 @@ class JobExecution:
         self, rig: Rig, planned: PlannedStage, scan: LoadedScan, task: StageTask
     ) -> tuple[Any, dict[str, Any]]:
         with Shooter(rig, self.control) as shooter:
-            return self._drive(shooter, planned, scan, task), _devices(rig)
+            result = self._drive(shooter, planned, scan, task)
+        return result, _devices(rig, shooter.waited_s)
 
     def _drive(
         self,
@@ -397,10 +398,11 @@ def _sentence(error: Exception) -> str:
     return f"Defect in the application: {type(error).__name__}: {error}; see the log."
 
 
-def _devices(rig: Rig) -> dict[str, Any]:
-    """Return who every device of a rig is, to be stored with what it captured."""
+def _devices(rig: Rig, waited_s: float) -> dict[str, Any]:
+    """Return who every device of a rig is, and how long they were waited for, to be stored with what they captured."""
     devices = {"rig": rig.info, "projector": rig.projector.info}
     cameras = {name: camera.info for name, camera in rig.cameras.items()}
     told = {name: asdict(info) for name, info in (devices | cameras).items()}
     told["rig"]["knows_truth"] = isinstance(rig, KnowsTruth)
+    told["rig"]["waited_s"] = round(waited_s, 3)
     return told

@@ -3,9 +3,10 @@
 Milliseconds become the devices' microseconds here. A shot that fails for a passing reason is taken again.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from types import TracebackType
 from typing import TypeVar
 
@@ -43,6 +44,8 @@ class Shooter:
         }
         self._asked: dict[str, CameraSettings] = {}
         self._stack = ExitStack()
+        self.waited_s = 0.0
+        """Time spent waiting for the devices, exposures included (a simulated rig's: its computing)."""
 
     @property
     def projector_size(self) -> tuple[int, int]:
@@ -66,7 +69,8 @@ class Shooter:
 
     def load(self, pictures: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
         """Hand over the patterns of a burst."""
-        self._rig.projector.load(pictures)
+        with self._waiting():
+            self._rig.projector.load(pictures)
 
     def take(
         self, index: int, *, exposure_ms: float, gain_db: float, cameras: Sequence[str]
@@ -98,9 +102,18 @@ class Shooter:
     def _once(
         self, index: int, settings: CameraSettings, cameras: Sequence[str]
     ) -> dict[str, Frame]:
-        self._each(cameras, lambda camera: self._prepare(camera, settings))
-        self._show(index)
-        return self._each(cameras, _expose)
+        with self._waiting():
+            self._each(cameras, lambda camera: self._prepare(camera, settings))
+            self._show(index)
+            return self._each(cameras, _expose)
+
+    @contextmanager
+    def _waiting(self) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.waited_s += time.perf_counter() - began
 
     def _prepare(self, camera: Camera, settings: CameraSettings) -> None:
         """Set and arm what isn't set and armed yet.

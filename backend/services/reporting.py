@@ -12,6 +12,7 @@ from backend.devices.protocols import KnowsTruth, Rig
 from backend.domain.errors import UnglareError
 from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
 from backend.jobs.plan import PlannedStage
+from backend.numerics.reasons import Reason
 from backend.numerics.scoring import DEFINITION, Score, Scores, Truth, score
 from backend.services.context import Context
 from backend.stages.cloud import Cloud
@@ -35,10 +36,17 @@ class ScanReport:
     """Predicted uncertainty that half of the points stay below."""
     duration_s: float
     """All present results together."""
+    waited_s: float
+    """Of these, what was spent waiting for the rig: its exposures, or its computing where it is simulated."""
     light_s: float | None
     """Exposure time of one camera's frames, if a stage tells."""
     scores: Scores | None
     """None: nobody knows the truth."""
+
+    @property
+    def computing_s(self) -> float:
+        """Own computing and storing, without waiting for the rig."""
+        return max(0.0, self.duration_s - self.waited_s)
 
     def document(self) -> dict[str, Any]:
         """Write the figures as JSON values; what can't be said is None."""
@@ -46,6 +54,8 @@ class ScanReport:
             "points": self.points,
             "median_sigma_mm": _number(self.median_sigma_mm),
             "duration_s": round(self.duration_s, 3),
+            "computing_s": round(self.computing_s, 3),
+            "rig_s": round(self.waited_s, 3),
             "light_s": _number(self.light_s),
             **truth_document(self.scores),
         }
@@ -88,6 +98,7 @@ def report(context: Context, scan: str) -> ScanReport:
         points=cloud.point_count if cloud else None,
         median_sigma_mm=cloud.median_sigma_mm if cloud else None,
         duration_s=sum(run.duration_s or 0.0 for run in runs),
+        waited_s=sum(run.device.get("rig", {}).get("waited_s", 0.0) for run in runs),
         light_s=light_s,
         scores=_scores(context, loaded, cloud) if cloud else None,
     )
@@ -121,11 +132,18 @@ def document_of(repositories: Repositories, result: RunRow | GivenRow) -> Mappin
 
 
 def compare_with_truth(cloud: Cloud, truth: Truth) -> Scores | None:
-    """Score a cloud; None where its points aren't one per pixel, which is what the truth is known for."""
-    x, y = cloud.pixel_x, cloud.pixel_y
-    if not (np.array_equal(x, np.round(x)) and np.array_equal(y, np.round(y))):
+    """Score a cloud; None if its reference camera isn't the one that the truth is known for."""
+    reference = reference_camera(cloud)
+    reasons = cloud.reasons.get(reference)
+    if cloud.depth_mm[reference].shape != truth.part.shape:
         return None
-    return score(cloud.points_mm, x.astype(np.int64), y.astype(np.int64), truth)
+    given_up = None if reasons is None else (reasons & np.uint16(Reason.SATURATED)) != 0
+    return score(cloud.points_mm, cloud.pixel_x, cloud.pixel_y, truth, over_exposed=given_up)
+
+
+def reference_camera(cloud: Cloud) -> str:
+    """Return the camera whose pixels the points belong to."""
+    return cloud.cameras[0] if cloud.cameras else next(iter(cloud.depth_mm))
 
 
 def rig_truth(
@@ -155,8 +173,7 @@ def _knew_truth(loaded: LoadedScan) -> bool:
 
 
 def _scores(context: Context, loaded: LoadedScan, cloud: Cloud) -> Scores | None:
-    reference = cloud.cameras[0] if cloud.cameras else next(iter(cloud.depth_mm))
-    truth = rig_truth(context, loaded, reference, cloud.cameras)
+    truth = rig_truth(context, loaded, reference_camera(cloud), cloud.cameras)
     return compare_with_truth(cloud, truth) if truth else None
 
 

@@ -1,12 +1,14 @@
 """What a scan is worth, and that nobody opens hardware to find out."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from backend.contract.requests import CreateScan
 from backend.domain.errors import NotFoundError
+from backend.numerics.reasons import Reason
 from backend.numerics.scoring import Score, Scores, Truth
 from backend.services.reporting import compare_with_truth, truth_document
 from tests.scans.houses import real_house, run_unattended
@@ -41,25 +43,38 @@ def test_a_simulated_rig_that_is_gone_costs_the_truth_only(tmp_path, monkeypatch
         unknown = services.report(state.id)
         services.export(state.id, str(tmp_path / "out"), False, "ada")
     assert known.scores is not None
+    assert 0 < known.waited_s < known.duration_s
+    assert known.document()["computing_s"] == pytest.approx(
+        known.duration_s - known.waited_s, abs=0.002
+    )
     assert unknown.scores is None
     assert unknown.points == known.points
     assert "no such rig" in caplog.text
 
 
-def test_points_between_pixels_have_no_score():
+def test_points_between_pixels_are_scored_and_saturated_ones_counted():
     cloud = make_cloud(10)
     flat = np.tile(np.array([0, 0, 700], np.float32), (1, 640, 1))
     lit, part = np.ones((1, 640), bool), np.zeros((1, 640), np.int16)
     truth = Truth(
         flat.astype(np.float32), np.zeros_like(flat, np.float32), lit, ~lit, part, ("wall",)
     )
-    assert compare_with_truth(cloud, truth) is not None
+    seen = {"left": np.full((1, 640), np.nan, np.float32)}
+    given_up = {"left": np.arange(640)[None].astype(np.uint16) % 2 * np.uint16(Reason.SATURATED)}
+    cloud = replace(cloud, depth_mm=seen, reasons=given_up)
+    whole = compare_with_truth(cloud, truth)
+    assert whole is not None
+    assert whole.total.over_exposed_share == 0.5
     cloud.pixel_x[0] += 0.5
-    assert compare_with_truth(cloud, truth) is None
+    between = compare_with_truth(cloud, truth)
+    assert between is not None
+    assert between.total.accepted == whole.total.accepted
+    elsewhere = {"left": np.full((2, 640), np.nan, np.float32)}
+    assert compare_with_truth(replace(cloud, depth_mm=elsewhere), truth) is None
 
 
 def test_what_cannot_be_said_is_null():
-    nothing = Score(0, 0, math.nan, math.nan, math.nan, math.nan, math.nan, math.nan)
+    nothing = Score(0, 0, *[math.nan] * 7)
     document = truth_document(Scores(nothing, {"hole": nothing}, 0, 0, 0))
     assert document["truth"]["completeness"] is None
     assert document["parts"]["hole"]["base"] == 0

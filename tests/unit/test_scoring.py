@@ -1,5 +1,6 @@
 """Completeness and error are counted as the definition says."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,7 @@ def test_known_errors_come_back():
     assert result.total.mean_mm == pytest.approx(np.mean(np.abs(good)), rel=1e-4)
     assert result.total.median_mm == pytest.approx(np.median(np.abs(good)), rel=1e-4)
     assert result.total.bias_mm == pytest.approx(np.mean(good), rel=1e-3)
+    assert result.total.std_mm == pytest.approx(np.std(np.abs(good)), rel=1e-3)
     assert list(result.parts) == ["wall"]
 
 
@@ -90,11 +92,80 @@ def test_nothing_measured_is_zero_complete_and_no_number_else():
 
 @pytest.mark.parametrize(
     ("x", "y", "sentence"),
-    [([30], [0], "outside"), ([-1], [0], "outside"), ([1, 1], [2, 2], "share 1")],
+    [([30], [0], "outside"), ([-1], [0], "outside"), ([29.6], [0], "29.6")],
 )
 def test_pixels_that_are_not_there_are_refused(x, y, sentence):
     with pytest.raises(NumericsError, match=sentence):
         score(np.zeros((len(x), 3)), np.array(x), np.array(y), wall())
+
+
+def slanted_points(truth: Truth, x: Any, y: Any) -> tuple[Truth, Any]:
+    """Lean the wall, and give its points at places between pixels."""
+    height, width = truth.part.shape
+    grid_y, grid_x = np.mgrid[:height, :width]
+
+    def at(x: Any, y: Any) -> Any:
+        ray = np.stack([(x - width / 2) / 2000, (y - height / 2) / 2000, np.ones_like(x)], -1)
+        return ray * (700.0 / (1 + 0.8 * ray[..., 0] - 0.5 * ray[..., 1]))[..., None]
+
+    surface = at(grid_x.astype(float), grid_y.astype(float)).astype(np.float32)
+    return replace(truth, points_mm=surface), at(x, y)
+
+
+def test_points_between_pixels_are_measured_along_their_own_rays():
+    random = np.random.default_rng(3)
+    x, y = random.uniform(0, 29, 400), random.uniform(0, 19, 400)
+    truth, points = slanted_points(wall(), x, y)
+    errors = random.normal(0, 0.05, 400)
+    moved = points + errors[:, None] * points / np.linalg.norm(points, axis=1, keepdims=True)
+    result = score(moved, x, y, truth)
+    assert result.total.accepted == 400
+    assert result.total.rms_mm == pytest.approx(np.sqrt(np.mean(errors**2)), rel=2e-3)
+    assert result.total.bias_mm == pytest.approx(np.mean(errors), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "pixels"),
+    [(5.0, 5.0, 1), (5.5, 5.0, 2), (5.5, 5.5, 4), (5.2, 5.0, 1), (5.3, 5.0, 2), (0.0, 0.4, 2)],
+)
+def test_a_point_counts_for_the_pixels_within_half_a_diagonal(x, y, pixels):
+    truth, points = slanted_points(wall(), np.array([x]), np.array([y]))
+    result = score(points, np.array([x]), np.array([y]), truth)
+    assert result.total.completeness * result.total.base == pytest.approx(pixels)
+
+
+def test_points_farther_apart_than_pixels_are_incomplete():
+    """Samples every 1.4 px leave none out along a row, samples every 3 px leave out a third."""
+    y = np.repeat(np.arange(20), 100)
+    for pitch_px, complete in ((1.4, 1.0), (3.0, 2 / 3)):
+        x = np.tile((np.arange(100) + 0.5) * pitch_px, 20)
+        inside = x < 29
+        truth, points = slanted_points(wall(), x[inside], y[inside].astype(float))
+        result = score(points, x[inside], y[inside], truth)
+        assert result.total.completeness == pytest.approx(complete, abs=0.05)
+
+
+def test_an_outlier_between_good_points_makes_no_pixel_incomplete_that_they_fill():
+    truth = wall()
+    x, y = np.array([5.0, 5.2, 8.0]), np.array([5.0, 5.0, 5.0])
+    points = truth.points_mm[5, [5, 5, 8]].astype(float)
+    points[1:, 2] += 3.0
+    result = score(points, x, y, truth)
+    assert result.total.completeness * result.total.base == pytest.approx(1)
+    assert result.total.outlier_share == pytest.approx(2 / 3)
+
+
+def test_what_was_given_up_as_saturated_is_counted_per_part():
+    truth = wall()
+    truth.part[:, 15:] = 1
+    truth.edge_band[:2] = True
+    given_up = np.zeros((20, 30), bool)
+    given_up[:11, 15:] = True
+    none = np.zeros(0, int)
+    result = score(np.zeros((0, 3)), none, none, truth, over_exposed=given_up)
+    assert result.parts["wall"].over_exposed_share == 0.0
+    assert result.parts["unused"].over_exposed_share == 0.5
+    assert np.isnan(score(np.zeros((0, 3)), none, none, truth).total.over_exposed_share)
 
 
 def test_a_depth_step_is_an_edge_two_pixels_to_either_side():
