@@ -57,7 +57,7 @@ def create_api(context: Context, *, station: Station | None = None, threads: int
     )
     app.state.context = context
     app.include_router(_everything())
-    app.add_middleware(Guard, unlimited=frozenset({imports.UPLOAD_PATH}))
+    app.add_middleware(Guard, unlimited=frozenset({imports.UPLOAD_PATH, artifacts.UPLOAD_PATH}))
     problems.install(app)
     _describe_by(app)
     return app

@@ -4,12 +4,19 @@ import hashlib
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
 from backend.api.binary import binary
 from backend.api.context import Uses, context_of
+from backend.api.errors import TooLargeError
 from backend.api.npy import npy_chunks, npy_size_bytes
 from backend.contract.base import Message
+from backend.contract.scans import ArtifactRef, PixelLevels
+from backend.services.array_uploads import LARGEST_UPLOAD_BYTES, UploadKind
+
+UPLOAD_PATH = "/api/artifacts"
+_FILE = {"type": "string", "format": "binary"}
 
 router = APIRouter(tags=["artifacts"])
 
@@ -24,6 +31,35 @@ class PixelValue(Message):
 
     value: Any
     """A number, a list for several channels, None where nothing is valid."""
+
+
+@router.post(
+    "/artifacts",
+    status_code=201,
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "description": "A .npy file, or a gray picture of 8 or 16 bit.",
+            "content": {
+                "application/octet-stream": {"schema": _FILE},
+                "image/png": {"schema": _FILE},
+            },
+        }
+    },
+)
+async def upload_array(
+    request: Request,
+    services: Uses,
+    kind: Annotated[
+        UploadKind,
+        Query(
+            description="mask: float32 from 0 to 1, full scale of a picture is 1; array: as it is."
+        ),
+    ] = UploadKind.MASK,
+) -> ArtifactRef:
+    """Keep an array that a setting can name by its hash, e.g. a painted mask."""
+    data = await _body(request, LARGEST_UPLOAD_BYTES)
+    return await run_in_threadpool(services.upload_array, data, kind)
 
 
 @router.get("/artifacts/{hash}", response_class=Response, responses=binary("application/x-npy"))
@@ -75,6 +111,20 @@ def artifact_at(
     return PixelValue(value=services.artifact_at(hash, x, y))
 
 
+@router.get("/scans/{scan}/stages/{stage}/fields/{field}/at")
+def levels_at(
+    scan: Annotated[str, Path(min_length=1, max_length=64)],
+    stage: Annotated[str, Path(min_length=1, max_length=100)],
+    field: Annotated[str, Path(min_length=1, max_length=100)],
+    services: Uses,
+    camera: Annotated[str, Query(max_length=100)],
+    x: Annotated[int, Query(ge=0, description="Column.")],
+    y: Annotated[int, Query(ge=0, description="Row.")],
+) -> PixelLevels:
+    """Tell the gray levels of all frames of a camera at one pixel."""
+    return services.levels_at(scan, stage, field, camera=camera, x=x, y=y)
+
+
 @router.get(
     "/stage-runs/{stage_run}/fields/{field}/points",
     response_class=Response,
@@ -101,6 +151,24 @@ def points(
 def seen_before(request: Request, tag: str) -> bool:
     """Tell whether the client holds this version already."""
     return tag in {t.strip() for t in request.headers.get("if-none-match", "").split(",")}
+
+
+async def _body(request: Request, limit_bytes: int) -> bytes:
+    """Read a body, counting what arrives."""
+    if int(request.headers.get("content-length", "0")) > limit_bytes:
+        raise _too_large(limit_bytes)
+    pieces = bytearray()
+    async for piece in request.stream():
+        pieces += piece
+        if len(pieces) > limit_bytes:
+            raise _too_large(limit_bytes)
+    return bytes(pieces)
+
+
+def _too_large(limit_bytes: int) -> TooLargeError:
+    return TooLargeError(
+        f"The upload is larger than {limit_bytes // 2**20} MiB: a mask has the projector's size, save it as that."
+    )
 
 
 def _tag(text: str) -> str:

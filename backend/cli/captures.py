@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from backend.cli.house import open_services, who
-from backend.cli.options import AsJson, DataFolder, Quiet, Settings, parse_settings
+from backend.cli.options import (
+    AsJson,
+    DataFolder,
+    Quiet,
+    Settings,
+    parse_settings,
+    with_uploads,
+)
 from backend.cli.output import Document, ProgressLines, answering, console, quiet_logging, table
 from backend.cli.scanning import (
     Out,
@@ -52,7 +59,7 @@ def import_capture(
             refuse_place(services, out)
             state = services.import_capture(str(capture), name, who(), progress.part("import"))
             answer.update(describe_scan(state))
-            _apply(services, state.id, changes)
+            _apply(services, state.id, with_uploads(services, state.method, changes))
             if run:
                 run_and_export(services, state.id, answer, progress, out=out, frames=frames)
             progress.finish()

@@ -3,18 +3,22 @@
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from backend.domain.errors import InvalidSettingError
+
+if TYPE_CHECKING:
+    from backend.services.services import Services
 
 Settings = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="STAGE.FIELD=VALUE",
-        help="Set one field of a stage's settings, e.g. exposures.budget=fast; JSON or text. Repeatable.",
+        help="Set one field of a stage's settings, e.g. exposures.budget=fast; JSON or text, "
+        "or for a mask the name of a picture or .npy file. Repeatable.",
     ),
 ]
 RigName = Annotated[
@@ -136,3 +140,53 @@ def parse_rig_options(
             )
         options[key.strip()] = parse_value(value.strip())
     return options
+
+
+def with_uploads(
+    services: "Services", method_name: str, settings: dict[str, dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Put files that settings name instead of arrays into the store, e.g. `refine_1.paint=mask.png`.
+
+    Raises
+    ------
+    InvalidSettingError
+        If such a file isn't there or can't be read; the sentence names setting and file.
+    """
+    return {
+        stage: {
+            field: _uploaded(services, f"{stage}.{field}", value)
+            if (method_name, stage, field) in _array_settings(services, method_name)
+            else value
+            for field, value in values.items()
+        }
+        for stage, values in settings.items()
+    }
+
+
+def _array_settings(services: "Services", method_name: str) -> set[tuple[str, str, str]]:
+    from backend.domain.arrays import ARRAY_FORMAT
+
+    return {
+        (method_name, stage.name, field)
+        for method in services.methods().methods
+        if method.name == method_name
+        for stage in method.stages
+        for field, described in stage.settings.get("properties", {}).items()
+        if any(
+            one.get("format") == ARRAY_FORMAT for one in (described, *described.get("anyOf", ()))
+        )
+    }
+
+
+def _uploaded(services: "Services", path: str, value: Any) -> Any:
+    from backend.services.array_uploads import looks_like_hash
+
+    if not isinstance(value, str) or looks_like_hash(value):
+        return value
+    try:
+        data = Path(value).expanduser().read_bytes()
+    except OSError as error:
+        raise InvalidSettingError(
+            f"--set {path}={value}: the file can't be read ({error.strerror}); name a .npy file or a gray picture."
+        ) from None
+    return services.upload_array(data).hash

@@ -40,6 +40,23 @@ class FieldView(Message):
     frames: tuple[FrameRef, ...] = ()
 
 
+class PixelLevels(Message):
+    """What every captured frame of a camera says at one pixel."""
+
+    camera: str
+    x: int
+    y: int
+    axis: tuple[float, ...] | None
+    """What the gray levels are shown over, one per frame; None: their numbers."""
+    gray: tuple[float, ...]
+    exposure_ms: tuple[float | None, ...]
+    full_scale_gray: float
+    slope: float | None = None
+    """Of the line fitted to this pixel, in gray per unit of the axis."""
+    offset: float | None = None
+    """Of that line, in gray."""
+
+
 class CheckView(Message):
     """One finding about a result."""
 

@@ -17,7 +17,13 @@ from backend.contract.requests import (
     UndoEdit,
 )
 from backend.contract.rigs import RigCheck, RigOffer, RigView
-from backend.contract.scans import AuditEntry, ScanState, ScanSummary
+from backend.contract.scans import (
+    ArtifactRef,
+    AuditEntry,
+    PixelLevels,
+    ScanState,
+    ScanSummary,
+)
 from backend.domain.errors import ConflictError
 from backend.domain.shots import Progress
 from backend.jobs.loading import load_scan
@@ -35,9 +41,11 @@ from backend.services import (
     running,
     scans,
 )
+from backend.services.array_uploads import UploadKind, store_upload
 from backend.services.context import Context
 from backend.services.events import EventHub
 from backend.services.export_folder import refuse_foreign
+from backend.services.pixels import levels_at
 from backend.services.points import pack_points
 from backend.services.previews import Format, Kind, draw, value_at
 from backend.services.rig_offers import offer_rigs
@@ -264,6 +272,16 @@ class Services:
     def artifact_at(self, hash: str, x: int, y: int) -> Any:
         """Return what an array says at column x of row y; None where it isn't finite."""
         return value_at(self.artifact(hash), x, y)
+
+    def upload_array(self, data: bytes, kind: UploadKind = UploadKind.MASK) -> ArtifactRef:
+        """Keep an uploaded `.npy` file or picture; see `array_uploads.store_upload`."""
+        return store_upload(self.context.store, data, kind)
+
+    def levels_at(
+        self, scan: str, stage: str, field: str, *, camera: str, x: int, y: int
+    ) -> PixelLevels:
+        """Return what all frames of a camera say at one pixel; see `pixels.levels_at`."""
+        return levels_at(self.context, scan, stage, field, camera=camera, x=x, y=y)
 
     def cloud_preview(
         self, stage_run: str, field: str, *, budget: int = 300_000, scalar: str | None = None

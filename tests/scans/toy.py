@@ -191,8 +191,13 @@ class FringesParams(Params):
 class Fringes:
     """The captured fringes."""
 
-    frames: Annotated[tuple[Frame, ...], Frames("Fringes")]
+    frames: Annotated[
+        tuple[Frame, ...], Frames("Fringes", x="shifts_rad", slope="slope", offset="offset")
+    ]
     note: Annotated[str, Value("Note")]
+    shifts_rad: Float[np.ndarray, "n"]
+    slope: Mapping[str, Float[np.ndarray, "h w"]]
+    offset: Mapping[str, Float[np.ndarray, "h w"]]
 
 
 @stage(title="Fringes", version=1, review=Review.ON_FAILURE)
@@ -203,7 +208,16 @@ def toy_fringes(
     if params.until:
         shoot(wait_plan(facts.reference))
     frames = shoot(fringe_plan(params))
-    return Fringes(frames, hint.text if hint else "no hint")
+    shifts = [2 * np.pi * k / params.steps for k in range(params.steps)] * len(params.exposures_ms)
+    size = HEIGHT_PX, WIDTH_PX
+    slope = {name: np.full(size, np.nan) for name in facts.cameras}
+    return Fringes(
+        frames,
+        hint.text if hint else "no hint",
+        np.array(shifts),
+        slope,
+        {name: np.full(size, 2.5) for name in facts.cameras},
+    )
 
 
 def fringe_plan(params: FringesParams) -> Plan[tuple[Frame, ...]]:

@@ -2,11 +2,21 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from backend.cli.options import parse_rig_options, parse_settings, parse_value
+from backend.cli.options import parse_rig_options, parse_settings, parse_value, with_uploads
 from backend.domain.errors import InvalidSettingError
+from tests.scans.toy_house import House, data_folder, inline_house
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Iterator[House]:
+    with inline_house(*data_folder(tmp_path / "data")) as house:
+        yield house
 
 
 @pytest.mark.parametrize(
@@ -90,3 +100,24 @@ def test_help_needs_nothing_heavy():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "check-rig" in done.stdout
     assert HEAVY & set(done.stderr.split()) == set()
+
+
+def test_a_file_takes_the_place_of_an_array(house: House, tmp_path: Path) -> None:
+    mask = np.full((2, 3), 0.5, np.float32)
+    np.save(tmp_path / "mask.npy", mask)
+    given = parse_settings(
+        [f"toy_levels.mask={tmp_path / 'mask.npy'}", "toy_levels.colour=mask.npy"]
+    )
+    settings = with_uploads(house.services, "toy", given)["toy_levels"]
+    np.testing.assert_array_equal(house.services.artifact(settings["mask"]), mask)
+    assert settings["colour"] == "mask.npy"
+    for value in (settings["mask"], None):
+        again = {"toy_levels": {"mask": value}}
+        assert with_uploads(house.services, "toy", again) == again
+
+
+def test_a_file_that_is_not_there_is_named(house: House) -> None:
+    with pytest.raises(
+        InvalidSettingError, match=r"toy_levels.mask=no.png: the file can't be read"
+    ):
+        with_uploads(house.services, "toy", {"toy_levels": {"mask": "no.png"}})
