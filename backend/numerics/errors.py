@@ -39,3 +39,15 @@ class CalibrationError(NumericsError):
 
 class MatchingError(NumericsError):
     """Two coordinate maps can't be matched: sizes differ, or nothing in them is valid."""
+
+
+class ResponseError(NumericsError):
+    """A response can't be determined: one exposure, nothing but clipped samples, a ramp that isn't monotone."""
+
+
+class ScreenError(NumericsError):
+    """The shape of a screen can't be used: too few points, not finite, or all on one line."""
+
+
+class MirrorError(NumericsError):
+    """A mirror's pose or surface can't be found: no outline, too few markers, or rays that miss it."""
