@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from backend.contract.requests import CreateScan, EditSettings, StartRun
 from backend.domain.errors import UnglareError
@@ -18,9 +16,9 @@ from backend.domain.shots import Progress
 from backend.jobs.loading import LoadedScan, load_scan
 from backend.numerics.scoring import Scores
 from backend.services import editing, running, scans
+from backend.services.contact_sheet import Panel, Picture, Row, contact_sheet, drawn, png
 from backend.services.context import Context
 from backend.services.export_folder import FolderKind, refuse_foreign, whole_folder
-from backend.services.previews import draw
 from backend.services.reporting import document_of, report, truth_document
 from backend.stages.cloud import Cloud
 from backend.stages.exposures import Exposures
@@ -32,12 +30,6 @@ from backend.storage.codec import decode
 METHOD = "hdr-fringe"
 COMPARISON = FolderKind("comparison.json", "unglare-comparison")
 _WHO = "compare"
-_PANEL_PX = 360
-_CAPTION_PX = 22
-_INK = (230, 230, 230)
-_PAPER = (30, 25, 22)
-
-Picture = UInt8[np.ndarray, "_h _w 3"]
 
 
 @dataclass(frozen=True)
@@ -76,13 +68,6 @@ STRATEGIES = (
 )
 
 
-class Panel(NamedTuple):
-    """One picture of a contact sheet."""
-
-    caption: str
-    picture: Picture
-
-
 class Scale(NamedTuple):
     """Values at both ends of the colours: those of the first strategy, so that rows can be compared."""
 
@@ -104,9 +89,9 @@ class Compared:
     """Light of the preview's and of all fringes, plus the time of computing."""
     points: int | None = None
     scores: Scores | None = None
-    panels: tuple["Panel", ...] = ()
+    panels: tuple[Panel, ...] = ()
     """Pictures of the reference camera."""
-    scale: "Scale | None" = None
+    scale: Scale | None = None
     """What the colours of its pictures mean."""
 
 
@@ -246,14 +231,14 @@ def _panels(
     name = next(iter(cloud.depth_mm))
     frames = [f for f in fringes.frames if f.camera == name]
     shortest, longest = (extreme(frames, key=_exposure_ms) for extreme in (min, max))
-    wrapped = _picture(phase.wrapped_rad[name], "twilight", (-np.pi, np.pi))
+    wrapped = drawn(phase.wrapped_rad[name], "twilight", (-np.pi, np.pi))
     return (
-        Panel(f"white field, {preview.t_pre_ms:.1f} ms", _picture(preview.white[name])),
-        Panel(f"shortest exposure, {_exposure_ms(shortest):.1f} ms", _picture(shortest.gray)),
-        Panel(f"longest exposure, {_exposure_ms(longest):.1f} ms", _picture(longest.gray)),
+        Panel(f"white field, {preview.t_pre_ms:.1f} ms", drawn(preview.white[name])),
+        Panel(f"shortest exposure, {_exposure_ms(shortest):.1f} ms", drawn(shortest.gray)),
+        Panel(f"longest exposure, {_exposure_ms(longest):.1f} ms", drawn(longest.gray)),
         Panel("wrapped phase", wrapped),
-        Panel("absolute phase", _picture(phase.projector_px[name], "turbo", scale.columns_px)),
-        Panel("depth of the points", _picture(cloud.depth_mm[name], "turbo", scale.depth_mm)),
+        Panel("absolute phase", drawn(phase.projector_px[name], "turbo", scale.columns_px)),
+        Panel("depth of the points", drawn(cloud.depth_mm[name], "turbo", scale.depth_mm)),
     )
 
 
@@ -261,27 +246,10 @@ def _exposure_ms(frame: Frame) -> float:
     return frame.exposure_ms or 0.0
 
 
-def _picture(
-    values: np.ndarray[Any, np.dtype[Any]],
-    colormap: str = "gray",
-    limits: tuple[float | None, float | None] = (None, None),
-) -> Picture:
-    low, high = limits
-    drawn = draw(
-        np.asarray(values), max_px=_PANEL_PX, colormap=colormap, low=low, high=high, format="jpeg"
-    )
-    return np.asarray(cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR), np.uint8)
-
-
-def contact_sheet(results: Sequence[Compared]) -> Picture:
+def _sheet(results: Sequence[Compared]) -> Picture:
     """Put the panels of one or several strategies side by side, a row for each."""
-    rows = [_row(result) for result in results if result.panels]
-    return np.vstack(rows) if rows else _line("no strategy has a cloud", _PANEL_PX)
-
-
-def _row(result: Compared) -> Picture:
-    pictures = np.hstack([_captioned(*panel) for panel in result.panels])
-    return np.vstack([_line(headline(result), pictures.shape[1]), pictures])
+    rows = [Row(headline(result), result.panels) for result in results]
+    return contact_sheet(rows, otherwise="no strategy has a cloud")
 
 
 def headline(result: Compared) -> str:
@@ -295,18 +263,6 @@ def headline(result: Compared) -> str:
         f"{text}, {total.completeness:.2%} complete, {total.outlier_share:.3%} outliers, "
         f"rms {total.rms_mm:.3f} mm"
     )
-
-
-def _captioned(caption: str, panel: Picture) -> Picture:
-    return np.vstack([_line(caption, panel.shape[1]), panel])
-
-
-def _line(text: str, width_px: int) -> Picture:
-    line = np.full((_CAPTION_PX, width_px, 3), _PAPER, np.uint8)
-    cv2.putText(
-        line, text, (4, _CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA
-    )
-    return line
 
 
 # tables and files
@@ -348,8 +304,8 @@ def write_comparison(folder: Path, results: Sequence[Compared]) -> tuple[Path, .
         target.write("comparison.csv", (_csv(results).encode(),))
         for result in results:
             if result.panels:
-                target.write(f"{result.strategy.name}.png", (_png(contact_sheet([result])),))
-        target.write("overview.png", (_png(contact_sheet(results)),))
+                target.write(f"{result.strategy.name}.png", (png(_sheet([result])),))
+        target.write("overview.png", (png(_sheet(results)),))
         document = {
             "format": COMPARISON.format,
             "version": 1,
@@ -384,9 +340,3 @@ def _csv(results: Sequence[Compared]) -> str:
             known = [figures[name] for name in (*FIGURES, "accepted")]
             writer.writerow([row["strategy"], part, *known])
     return text.getvalue()
-
-
-def _png(picture: Picture) -> bytes:
-    done, data = cv2.imencode(".png", picture)
-    assert done, "an uint8 picture of three channels can always be written"
-    return data.tobytes()
