@@ -6,6 +6,7 @@ MODULES = (
     "backend.numerics.absolute_phase",
     "backend.numerics.phasors",
     "backend.numerics.gray_code",
+    "backend.numerics.edges",
     "backend.numerics.warm_up_geometry",
     "backend.numerics.gathering",
 )
