@@ -10,6 +10,7 @@ from backend.cli import (
     checking,
     comparing,
     describing,
+    reports,
     scanning,
     serving,
 )
@@ -27,7 +28,7 @@ application = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (serving, scanning, captures, describing, checking, comparing, benchmarking):
+for group in (serving, scanning, captures, describing, checking, comparing, reports, benchmarking):
     group.register(application)
 
 

@@ -51,6 +51,14 @@ Size = Annotated[
         show_default=False,
     ),
 ]
+ProjectorSize = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WIDTHxHEIGHT",
+        help="Size of the simulated projector.  [default: 1280x800]",
+        show_default=False,
+    ),
+]
 Seed = Annotated[
     int | None, typer.Option(help="Seed of the simulated noise.  [default: 0]", show_default=False)
 ]
@@ -121,6 +129,7 @@ def parse_rig_options(
     *,
     scene: str | None = None,
     size: str | None = None,
+    projector_size: str | None = None,
     seed: int | None = None,
 ) -> dict[str, Any]:
     """Read `KEY=VALUE` and put the options of the simulated rig with them, as far as they are given.
@@ -130,7 +139,7 @@ def parse_rig_options(
     InvalidSettingError
         Naming the text that isn't of that form.
     """
-    named = {"scene": scene, "size": size, "seed": seed}
+    named = {"scene": scene, "size": size, "projector_size": projector_size, "seed": seed}
     options = {name: value for name, value in named.items() if value is not None}
     for text in texts or ():
         key, equals, value = text.partition("=")

@@ -9,6 +9,7 @@ from backend.cli.house import open_services, who
 from backend.cli.options import (
     AsJson,
     DataFolder,
+    ProjectorSize,
     Quiet,
     RigName,
     RigOptions,
@@ -47,6 +48,7 @@ def scan(
     ] = "hdr-fringe",
     settings: Settings = None,
     size: Size = None,
+    projector_size: ProjectorSize = None,
     seed: Seed = None,
     rig_options: RigOptions = None,
     preset: Annotated[str | None, typer.Option(help="Named set of settings of the method.")] = None,
@@ -68,7 +70,9 @@ def scan(
         request = CreateScan(
             method=method,
             rig=rig,
-            rig_options=parse_rig_options(rig_options, scene=scene, size=size, seed=seed),
+            rig_options=parse_rig_options(
+                rig_options, scene=scene, size=size, projector_size=projector_size, seed=seed
+            ),
             name=name,
             preset=preset,
             settings=parse_settings(settings),

@@ -1,0 +1,104 @@
+"""`unglare report`: tables and figures as the papers have them, for a rig or a scene."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from backend.cli.house import open_services
+from backend.cli.options import (
+    AsJson,
+    DataFolder,
+    ProjectorSize,
+    Quiet,
+    RigName,
+    RigOptions,
+    Size,
+    parse_rig_options,
+)
+from backend.cli.output import ProgressLines, answering, console, quiet_logging, table
+
+if TYPE_CHECKING:
+    from backend.domain.shots import Progress
+    from backend.services.context import Context
+    from backend.services.report_document import Report
+
+Out = Annotated[
+    Path | None, typer.Option(help="Folder for report.html, the tables as CSV and the pictures.")
+]
+Make = Callable[["Context", "Progress"], "Report"]
+
+_reports = typer.Typer(
+    name="report",
+    help="Tables and figures as the papers have them; writes CSV, pictures and a page.",
+    no_args_is_help=True,
+)
+
+
+def register(application: typer.Typer) -> None:
+    """Add the commands of this module."""
+    application.add_typer(_reports)
+
+
+@_reports.command(name="table-i")
+def table_i(
+    out: Out = None,
+    size: Size = None,
+    projector_size: ProjectorSize = None,
+    rig: RigName = "simulated",
+    rig_options: RigOptions = None,
+    data: DataFolder = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Tell what an error of the assumed height costs in projector pixels, from the rig's calibration."""
+    from backend.services.table_i import table_i as make
+
+    options = parse_rig_options(rig_options, size=size, projector_size=projector_size)
+    _report(
+        lambda context, progress: make(context, rig, options),
+        out=out,
+        data=data,
+        as_json=as_json,
+        quiet=quiet,
+    )
+
+
+def _report(make: Make, *, out: Path | None, data: Path | None, as_json: bool, quiet: bool) -> None:
+    """Make a report, write it, show it."""
+    from backend.services.report_document import refuse_report_folder, write_report
+
+    quiet_logging()
+    found: Report | None = None
+    with answering(as_json) as answer, ProgressLines(hidden=quiet) as progress:
+        if out is not None:
+            refuse_report_folder(out)
+        with open_services(data) as services:
+            found = make(services.context, lambda done, text="": progress.step(text, 0.0))
+        progress.finish()
+        answer.update(found.document())
+        answer["files"] = []
+        if out is not None:
+            answer["files"] = [str(file) for file in write_report(out, found)]
+    if not as_json and found is not None:
+        _show(found)
+        if out is not None:
+            console().print(f"page, tables and pictures are in {out}")
+
+
+def _show(report: "Report") -> None:
+    out = console()
+    out.print(report.title)
+    for shown in report.tables:
+        numbers = {
+            column.name: any(isinstance(row.get(column.name), int | float) for row in shown.rows)
+            for column in shown.columns
+        }
+        titles = [f">{c.title}" if numbers[c.name] else c.title for c in shown.columns]
+        rows = table(*titles, title=shown.title)
+        for row in shown.rows:
+            rows.add_row(*(column.words(row.get(column.name)) for column in shown.columns))
+        out.print(rows)
+    for text in (*report.findings, *report.introduction):
+        out.print(text)
