@@ -152,8 +152,8 @@ class ResponseProblem:
         normal = weighted.T @ rows + self._smoothness
         right = weighted.T @ (target - target_mean[:, None]).ravel()
         coefficients = np.linalg.lstsq(normal, right, rcond=_SINGULAR)[0]  # by SVD
-        curve: Float64[np.ndarray, "level"] = self._basis @ coefficients
-        return curve - curve[mid_gray(self.levels)]
+        curve = self._basis @ coefficients
+        return np.asarray(curve - curve[mid_gray(self.levels)], np.float64)
 
     def residual(self, curve: Float[np.ndarray, "level"]) -> float:
         """Return the rms of g(G) - ln E - ln dt over the samples used, i.e. the relative error of the light."""
@@ -208,5 +208,5 @@ def opencv_response(
     calibrate = cv2.createCalibrateDebevec(side * side, smoothness, False)
     times = np.asarray(exposures_ms, np.float32)
     light = calibrate.process(pictures, times)[:, 0, 0].astype(np.float64)
-    curve: Float64[np.ndarray, "256"] = np.log(np.maximum(light, np.finfo(float).tiny))
-    return curve - curve[mid_gray(LEVELS_8_BIT)]
+    curve = np.log(np.maximum(light, np.finfo(float).tiny))
+    return np.asarray(curve - curve[mid_gray(LEVELS_8_BIT)], np.float64)

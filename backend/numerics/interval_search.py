@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 
 from backend.numerics.camera_response import ResponseProblem
 from backend.numerics.errors import ResponseError
@@ -70,8 +70,8 @@ def search_interval(
             f"no interval within the ramp's {ramp.gray_low:.0f} to {ramp.gray_high:.0f} gray has a response that grows: "
             f"check that stack and ramp were taken with the same camera settings"
         )
-    row, column = np.unravel_index(int(np.nanargmin(costs)), costs.shape)
-    pairs = _around(int(axis[column]), int(axis[row]), step, fine=max(1, round(scale)))
+    upper, lower = divmod(int(np.nanargmin(costs)), axis.size)
+    pairs = _around(int(axis[lower]), int(axis[upper]), step, fine=max(1, round(scale)))
     best = min(pairs, key=lambda pair: trial.ranked(*pair))
     return IntervalSearch(
         best=interval_of(trial.control, *best),
@@ -96,7 +96,7 @@ class _Trial:
     ) -> None:
         self._problem, self._ramp, self._weight = problem, ramp, resolution_weight
         self._first = problem.solve()
-        self.control: Float[np.ndarray, "level"] = control_of_gray(ramp, problem.levels)
+        self.control = control_of_gray(ramp, problem.levels)
         known = np.flatnonzero(np.isfinite(self.control))
         self._lowest, self._highest = int(known[0]), int(known[-1])
 

@@ -117,7 +117,7 @@ def _noisy(
     sigma = np.interp(gray, rising, np.sqrt(variance))
     draws = np.random.default_rng(_SEED).standard_normal((DRAWS, *gray.shape))
     sampled = np.clip(np.rint(gray + sigma * draws), 0, response.full_scale_gray)
-    return sampled.astype(np.intp)
+    return np.asarray(sampled, np.intp)
 
 
 def _wrapped(angle_rad: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
