@@ -5,6 +5,10 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Axis = Literal["x", "y"]
+Codes = Annotated[
+    tuple[Annotated[float, Field(ge=0, le=255)], ...], Field(min_length=2, max_length=1024)
+]
+"""A display's table."""
 
 
 class _Pattern(BaseModel):
@@ -23,6 +27,9 @@ class Sine(_Pattern):
     """A - B, the darkest code projected."""
     high_gray: float = Field(255.0, ge=0, le=255, exclude_if=lambda v: v == 255.0)
     """A + B, the brightest code projected."""
+    codes: Codes | None = Field(None, exclude_if=lambda v: v is None)
+    """Code shown for equidistant codes asked for, from 0 to 255: bends a fringe the other way round before a screen
+    that isn't linear does. None: shown as asked for."""
 
 
 class Gray(_Pattern):

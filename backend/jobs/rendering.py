@@ -81,6 +81,7 @@ def _sine(pattern: Sine, width_px: int, height_px: int, gamma: float) -> UInt8[n
         low_gray=pattern.low_gray,
         high_gray=pattern.high_gray,
         gamma=gamma,
+        codes=None if pattern.codes is None else np.array(pattern.codes),
     )
 
 

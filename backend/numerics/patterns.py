@@ -6,7 +6,7 @@ Coordinates as everywhere here: projector pixel u of W stands at x = (u + 1/2)/W
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float, Float64, UInt8
 
 from backend.numerics.errors import PatternError
 
@@ -54,6 +54,7 @@ def sine_pattern(
     low_gray: float = 40.0,
     high_gray: float = 220.0,
     gamma: float = 1.0,
+    codes: Float[np.ndarray, "n_codes"] | None = None,
 ) -> UInt8[np.ndarray, "h w"]:
     r"""Render fringes, calculated in float and rounded once.
 
@@ -72,6 +73,8 @@ def sine_pattern(
     gamma
         The projector's light is proportional to (gray/255)**gamma. 1 means linear; otherwise the
         gray levels are bent so that the light is a sinusoid between the light of low and high.
+    codes
+        Gray level shown for equidistant gray levels from 0 to 255, straight between them; replaces `gamma`. None: no table.
 
     Raises
     ------
@@ -96,11 +99,16 @@ def sine_pattern(
     if not (np.isfinite(gamma) and gamma > 0):
         raise PatternError(f"a gamma of {gamma} has no inverse: give a number > 0, 1 for linear")
     x = pattern_coordinate(width_px, height_px, axis)
+    if codes is not None:
+        gamma = 1.0
     low_light, high_light = (low_gray / WHITE) ** gamma, (high_gray / WHITE) ** gamma
     cosine = np.cos(2 * np.pi * periods * x + offset_rad + shift_rad)
     light = low_light + (high_light - low_light) * (0.5 + 0.5 * cosine)
     # Rounding may leave the light a hair below 0, where the root isn't real.
-    profile = np.rint(WHITE * np.maximum(light, 0.0) ** (1 / gamma)).astype(np.uint8)
+    shown = WHITE * np.maximum(light, 0.0) ** (1 / gamma)
+    if codes is not None:
+        shown = np.clip(np.interp(shown, np.linspace(0, WHITE, codes.size), codes), 0, WHITE)
+    profile = np.rint(shown).astype(np.uint8)
     return _spread(profile, width_px, height_px, axis)
 
 
