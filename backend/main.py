@@ -150,10 +150,15 @@ def build_application(
     )
 
 
+def _say(text: str) -> None:
+    """Print at once: in a file or a pipe the address would wait for more lines, which never come."""
+    print(text, flush=True)
+
+
 def serve(
     settings: Settings,
     *,
-    announce: Callable[[str], None] = print,
+    announce: Callable[[str], None] = _say,
     prepare: Callable[[Services], None] | None = None,
 ) -> None:
     """Serve the application until it is told to stop (Ctrl+C or SIGTERM).

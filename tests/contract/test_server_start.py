@@ -27,7 +27,9 @@ HEAVY = {"open3d", "viser", "pytest", "matplotlib", "plotly"}
 
 
 def environment(folder: Path, **settings: str) -> dict[str, str]:
-    kept = {n: v for n, v in os.environ.items() if not n.startswith("UNGLARE_")}
+    # Without PYTHONUNBUFFERED, as on a plain machine: the address has to come through a pipe at once.
+    dropped = ("UNGLARE_", "PYTHONUNBUFFERED")
+    kept = {n: v for n, v in os.environ.items() if not n.startswith(dropped)}
     named = {f"UNGLARE_{name.upper()}": value for name, value in settings.items()}
     return kept | {"UNGLARE_DATA_FOLDER": str(folder), "UNGLARE_PORT": "0"} | named
 
