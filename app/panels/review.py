@@ -98,7 +98,7 @@ class ReviewPanel:
                 self._gui, self._desk.api.array(reference.hash),
                 x=_sibling(self._desk.api, look.stage, hint.get("x"), camera),
                 x_axis=Axis(str(hint.get("x_title") or "")), y_axis=Axis("", str(hint.get("unit") or "")),
-                log_y=bool(hint.get("log_y")),
+                names=tuple(hint.get("names") or ()), log_y=bool(hint.get("log_y")),
             )  # fmt: skip
 
     def _add_table(self, look: Look, field: FieldView) -> None:

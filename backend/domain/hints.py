@@ -88,6 +88,8 @@ class Curve(Hint):
     x_title: str = ""
     unit: str = ""
     log_y: bool = False
+    names: tuple[str, ...] = ()
+    """What each of several curves is called in the legend."""
 
 
 @dataclass(frozen=True)
