@@ -54,6 +54,10 @@ class RigConformance:
     exposure_us = 50_000.0
     """An exposure at which the white field gives a good picture: a multiple of the frame period."""
 
+    def light(self, share: np.ndarray) -> np.ndarray:
+        """Return the light of gray levels over full scale: override it where the camera has a tone curve."""
+        return share
+
     # ------------------------------------------------------------ identity and state
 
     def test_names_and_info(self, rig: Rig) -> None:
@@ -351,7 +355,7 @@ class RigConformance:
         rig.projector.blank(projector_level)
         camera.configure(replace(camera.settings, exposure_us=exposure_us, gain_db=gain_db))
         with _armed(rig):
-            data = _shot(camera).data
+            frame = _shot(camera)
         rig.projector.blank(255)
         camera.configure(replace(camera.settings, exposure_us=self.exposure_us, gain_db=0.0))
         with _armed(rig):
@@ -359,7 +363,7 @@ class RigConformance:
         full = 2**white.bits - 1
         usable = (white.data > 0.2 * full) & (white.data < 0.8 * full)
         assert usable.any(), "nothing in the picture is well exposed; change exposure_us"
-        return float(data[usable].mean())
+        return float(full * self.light(frame.data[usable] / full).mean())
 
     # ------------------------------------------------------------ errors
 

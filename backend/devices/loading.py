@@ -16,7 +16,10 @@ from backend.devices.protocols import Rig
 from backend.domain.errors import UnglareError
 
 GROUP = "unglare.rigs"
-_BUILT_IN = {"simulated": "backend.devices.sim:create_rig"}
+_BUILT_IN = {
+    "simulated": "backend.devices.sim:create_rig",
+    "sim-lcd": "backend.devices.sim:create_lcd_rig",
+}
 
 _REQUIRED = (
     *("name", "info", "cameras", "projector", "facts", "calibration"),

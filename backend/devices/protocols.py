@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from backend.domain.rig import RigCalibration, RigFacts
+from backend.numerics.mirror_scoring import MirrorTruth
 from backend.numerics.scoring import Truth
 
 
@@ -377,4 +378,13 @@ class KnowsTruth(Protocol):
         `cameras` are those that the scan used (None: all): a pixel belongs to the base of
         completeness only if every one of them sees it.
         """
+        ...
+
+
+@runtime_checkable
+class KnowsMirrorTruth(KnowsTruth, Protocol):
+    """A rig that knows slopes and heights of the mirror that it looks at. For a scan's report only, never for a stage."""
+
+    def mirror_truth(self, reference: str) -> MirrorTruth:
+        """Return true slopes and heights behind each pixel of the reference camera, in the mirror's frame."""
         ...

@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
@@ -25,12 +26,66 @@ from backend.devices.protocols import (
     TriggerSource,
 )
 from backend.devices.sim.clock import Clock
-from backend.devices.sim.config import SimulatedRigConfig
 from backend.devices.sim.link import Link
 from backend.devices.sim.renderer import Shown
 
 _READOUT_S = 0.004
 _FORMATS = {"Mono8": 8, "Mono12": 12}
+
+
+@runtime_checkable
+class CameraOptions(Protocol):
+    """What a rig's options say of its cameras; `SimulatedRigConfig` explains them."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in [px]."""
+        ...
+
+    @property
+    def bit_depth(self) -> int:
+        """Bits per pixel at the start."""
+        ...
+
+    @property
+    def exposure_min_ms(self) -> float:
+        """Shortest exposure."""
+        ...
+
+    @property
+    def exposure_max_ms(self) -> float:
+        """Longest exposure."""
+        ...
+
+    @property
+    def gain_max_db(self) -> float:
+        """Largest gain."""
+        ...
+
+    @property
+    def fault_device(self) -> str:
+        """Name of the camera that the faults befall."""
+        ...
+
+    @property
+    def fail_after_frames(self) -> int | None:
+        """It is disconnected after so many frames."""
+        ...
+
+    @property
+    def fail_for_good(self) -> bool:
+        """It can't be reconnected then."""
+        ...
+
+    @property
+    def drop_every(self) -> int | None:
+        """Every so many frames arrive incomplete."""
+        ...
+
+    @property
+    def hang_at_frame(self) -> int | None:
+        """The frame that is never delivered."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -65,7 +120,7 @@ class SimulatedCamera(Link):
     def __init__(
         self,
         name: str,
-        config: SimulatedRigConfig,
+        config: CameraOptions,
         clock: Clock,
         *,
         look: Callable[[], Shown],
@@ -283,7 +338,7 @@ class SimulatedCamera(Link):
 class _Faults:
     """What the configuration wants to go wrong with one camera."""
 
-    def __init__(self, config: SimulatedRigConfig, name: str) -> None:
+    def __init__(self, config: CameraOptions, name: str) -> None:
         mine = config.fault_device == name
         self._fail_after = config.fail_after_frames if mine else None
         self._drop_every = config.drop_every if mine else None

@@ -164,6 +164,23 @@ GAMMA = power_curve(2.2)
 INVERSE = power_curve(1.0 / 2.2)
 FILM = film_curve(1.6, 1.0 / 2.2)
 LCD = s_curve(1.35, 2.2)
+MEASURED = measured_curve(
+    np.linspace(0.0, 1.0, 18),
+    np.array(
+        [
+            *(0.0, 0.0021, 0.0085, 0.0201, 0.0384, 0.0643, 0.0985, 0.1406, 0.1911),
+            *(0.2507, 0.3176, 0.3942, 0.4782, 0.5741, 0.6786, 0.7912, 0.9025, 1.0),
+        ]
+    ),
+)
+"""Codes 0, 15 ... 255 of an office panel that leaves the power law near white, made up."""
+
+DISPLAYS: Mapping[str, Curve] = MappingProxyType(
+    {"linear": LINEAR, "gamma": GAMMA, "lcd": LCD, "measured": MEASURED}
+)
+"""Screens by name."""
+TONES: Mapping[str, Curve] = MappingProxyType({"linear": LINEAR, "inverse": INVERSE, "film": FILM})
+"""Cameras by name."""
 
 CHAINS: Mapping[str, Chain] = MappingProxyType(
     {

@@ -1,19 +1,12 @@
 """Every setting of the simulated rig, in physical units."""
 
-from collections.abc import Mapping
-from typing import Any
+from pydantic import Field, field_validator
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
-
-from backend.devices.errors import RigConfigError
-
-Size = tuple[int, int]
+from backend.devices.sim.options import RigOptions, Size
 
 
-class SimulatedRigConfig(BaseModel):
+class SimulatedRigConfig(RigOptions):
     """What stands before the simulated rig, how the rig is built, and what goes wrong with it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     scene: str = Field(
         "high-contrast",
@@ -105,35 +98,11 @@ class SimulatedRigConfig(BaseModel):
     projector_fail_after_shows: int | None = Field(None, ge=0)
     """The projector is disconnected after so many patterns."""
 
-    @field_validator("size", "projector_size", mode="before")
+    @field_validator("samples")
     @classmethod
-    def _size_from_text(cls, value: object) -> object:
-        if isinstance(value, str) and value.lower().count("x") == 1:
-            return tuple(part.strip() for part in value.lower().split("x"))
-        return value
-
-    @field_validator("size", "projector_size")
-    @classmethod
-    def _size_in_range(cls, value: Size) -> Size:
-        width, height = value
-        if not (64 <= width <= 8192 and 48 <= height <= 8192):
-            raise ValueError(f"{width}x{height} is not within 64x48 to 8192x8192")
-        return value
-
-    @field_validator("bit_depth", "samples")
-    @classmethod
-    def _one_of(cls, value: int, info: Any) -> int:
-        allowed = {"bit_depth": (8, 12), "samples": (1, 4, 16)}[info.field_name]
-        if value not in allowed:
-            raise ValueError(f"{value} is not one of {', '.join(map(str, allowed))}")
-        return value
-
-    @field_validator("exposure_max_ms")
-    @classmethod
-    def _longer_than_min(cls, value: float, info: Any) -> float:
-        shortest = info.data.get("exposure_min_ms", 0.0)
-        if value <= shortest:
-            raise ValueError(f"{value:g} is not above exposure_min_ms {shortest:g}")
+    def _square_of_two(cls, value: int) -> int:
+        if value not in (1, 4, 16):
+            raise ValueError(f"{value} is not one of 1, 4, 16")
         return value
 
     @field_validator("fault_device")
@@ -142,27 +111,3 @@ class SimulatedRigConfig(BaseModel):
         if value not in ("left", "right"):
             raise ValueError(f"{value} is not left or right")
         return value
-
-    @classmethod
-    def from_options(cls, options: Mapping[str, object]) -> "SimulatedRigConfig":
-        """Read a mapping, e.g. from the command line, where every value may be text.
-
-        Raises
-        ------
-        RigConfigError
-            If a key is unknown or a value can't be used; one sentence names the first of them.
-        """
-        try:
-            return cls.model_validate(dict(options))
-        except ValidationError as error:
-            raise RigConfigError(_sentence(error)) from None
-
-
-def _sentence(error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
-    option = str(first["loc"][0]) if first["loc"] else "options"
-    if first["type"] == "extra_forbidden":
-        names = ", ".join(SimulatedRigConfig.model_fields)
-        return f"simulated rig: there is no option {option!r}; the options are {names}"
-    problem = first["msg"].removeprefix("Value error, ")
-    return f"simulated rig: option {option} can't be {first['input']!r}: {problem[0].lower() + problem[1:]}"

@@ -40,7 +40,7 @@ def _mixed(x: Any) -> Any:
 
 
 @row_loop
-def _hash_row(first: Any, key_a: Any, key_b: Any, bits: Any) -> Any:
+def hash_row(first: Any, key_a: Any, key_b: Any, bits: Any) -> Any:
     """Two rounds: with one, two frames' noise would be shifted copies of each other."""
     for i in range(bits.size):
         x = _mixed(np.uint32(np.uint32(first) + np.uint32(i) + key_a))
@@ -48,7 +48,8 @@ def _hash_row(first: Any, key_a: Any, key_b: Any, bits: Any) -> Any:
 
 
 @row_loop
-def _normal_row(bits: Any, table: Any, noise: Any) -> Any:
+def normal_row(bits: Any, table: Any, noise: Any) -> Any:
+    """Turn random bits into standard normal noise."""
     for i in range(noise.size):
         x = bits[i]
         low, high = x & np.uint32(4095), (x >> np.uint32(12)) & np.uint32(4095)
@@ -89,8 +90,8 @@ def expose(
     for y in numba.prange(height):
         bits = np.empty(width, np.uint32)
         noise = np.empty(width, np.float32)
-        _hash_row(y * width, key_a, key_b, bits)
-        _normal_row(bits, table, noise)
+        hash_row(y * width, key_a, key_b, bits)
+        normal_row(bits, table, noise)
         _expose_row(charge[y], noise, read_variance, gray_per_e, black, full_scale, out[y])
 
 

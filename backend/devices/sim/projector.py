@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import UInt8
 
-from backend.devices.errors import FeatureError, GeometryError
+from backend.devices.errors import FeatureError
 from backend.devices.protocols import DeviceInfo, Presented, ProjectorCapabilities
 from backend.devices.sim.clock import Clock
 from backend.devices.sim.config import SimulatedRigConfig
-from backend.devices.sim.link import Link
+from backend.devices.sim.display import Display
 from backend.devices.sim.renderer import Shown
 
 TriggerLine = Callable[[Shown, float, float], None]
@@ -20,17 +20,18 @@ TriggerLine = Callable[[Shown, float, float], None]
 _MAX_SEQUENCE = 512
 
 
-class SimulatedProjector(Link):
+class SimulatedProjector(Display):
     """A `SequenceProjector`. What it shows at the moment is `shown`; cameras read it when they are triggered."""
 
     def __init__(self, config: SimulatedRigConfig, clock: Clock) -> None:
         super().__init__(
-            "projector", DeviceInfo("unglare", "simulated DLP", serial="SIM-P", simulated=True)
+            "projector",
+            DeviceInfo("unglare", "simulated DLP", serial="SIM-P", simulated=True),
+            config.projector_size,
         )
         self._config = config
         self._clock = clock
         self._period_s = (config.frame_period_ms or 0.0) / 1000.0
-        self._patterns: list[UInt8[np.ndarray, "h w"]] = []
         self._shows = 0
         self._failed = False
         self._stop = threading.Event()
@@ -50,38 +51,6 @@ class SimulatedProjector(Link):
             linear=self._config.gamma == 1.0,
             trigger_out=True,
         )
-
-    def load(self, patterns: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
-        """Take patterns; they are copied."""
-        self._need_link()
-        width, height = self._config.projector_size
-        for index, pattern in enumerate(patterns):
-            if pattern.shape != (height, width):
-                size = "x".join(map(str, pattern.shape[::-1]))
-                raise GeometryError(
-                    self.name,
-                    f"pattern {index} is {size}, the display {width}x{height};"
-                    " render patterns in the display's size",
-                )
-        self._patterns = [self._frozen(pattern) for pattern in patterns]
-
-    def show(self, index: int, timeout_s: float = 2.0) -> Presented:
-        """Show a loaded pattern; lit when this returns."""
-        del timeout_s  # the display always follows
-        self._need_link()
-        if not 0 <= index < len(self._patterns):
-            raise FeatureError(
-                self.name,
-                f"there is no pattern {index}, {len(self._patterns)} are loaded; load first",
-            )
-        return self._present(self._patterns[index], index)
-
-    def blank(self, level: int = 0) -> Presented:
-        """Show the whole field at one code."""
-        self._need_link()
-        if not 0 <= level <= 255:
-            raise FeatureError(self.name, f"level {level} is not within 0 to 255; choose another")
-        return self._present(self._uniform(level), -1)
 
     def arm_sequence(self, indices: Sequence[int], exposure_us: float, period_us: float) -> None:
         """Prepare a run."""
@@ -137,12 +106,3 @@ class SimulatedProjector(Link):
         if settle:  # a pattern is whole from the next frame period on
             self._clock.wait_until(self._clock.now_s() + self._period_s, self._stop)
         return Presented(index, time.monotonic(), self._clock.now_s(), confirmed=True)
-
-    def _uniform(self, level: int) -> UInt8[np.ndarray, "h w"]:
-        width, height = self._config.projector_size
-        return self._frozen(np.full((height, width), level, np.uint8))
-
-    def _frozen(self, pattern: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-        copy = np.array(pattern, dtype=np.uint8, order="C")
-        copy.setflags(write=False)
-        return copy
