@@ -6,11 +6,17 @@ Sensors 23(23), 9299 (2023), doi:10.3390/s23239299.
 
 from backend.domain.method import Method
 from backend.domain.rig import RigCalibration, RigFacts
+from backend.stages.camera_response import camera_response
+from backend.stages.interval import interval
+from backend.stages.linearise import linearise
+from backend.stages.ramp import Ramp, ramp
+from backend.stages.stack import import_stack, stack
 
 METHOD = Method(
     name="fringe-reflection",
     title="Fringe reflection",
     doc="Measures mirrors: fringes on a screen, seen through the part, tell the slope of every point.",
-    stages=(),
-    given=(RigFacts, RigCalibration),
+    stages=(stack, camera_response, ramp, interval, linearise),
+    given=(RigFacts, RigCalibration, Ramp),
+    importers={"stack": import_stack},
 )

@@ -31,6 +31,7 @@ def search_interval(
     *,
     resolution_weight: float = 20.0,
     grid_gray: int = 5,
+    at: tuple[int, int] | None = None,
 ) -> IntervalSearch:
     r"""Search all pairs of gray levels for the smallest U, then in steps of one gray around it.
 
@@ -44,11 +45,13 @@ def search_interval(
         :math:`\eta`: what a coarse range costs beside a bent one.
     grid_gray
         Step of the full search, in gray levels of 8 bit.
+    at
+        Darkest and brightest gray level where they are chosen already; None: the best ones.
 
     Raises
     ------
     ResponseError
-        If no pair is left: the ramp is too short, or no response grows.
+        If no pair is left: the ramp is too short, or no response grows; or if the ramp doesn't reach `at`.
 
     Notes
     -----
@@ -72,7 +75,7 @@ def search_interval(
         )
     upper, lower = divmod(int(np.nanargmin(costs)), axis.size)
     pairs = _around(int(axis[lower]), int(axis[upper]), step, fine=max(1, round(scale)))
-    best = min(pairs, key=lambda pair: trial.ranked(*pair))
+    best = at or min(pairs, key=lambda pair: trial.ranked(*pair))
     return IntervalSearch(
         best=interval_of(trial.control, *best),
         cost=trial.cost(*best),
