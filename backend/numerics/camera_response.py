@@ -155,13 +155,14 @@ class ResponseProblem:
         curve = self._basis @ coefficients
         return np.asarray(curve - curve[mid_gray(self.levels)], np.float64)
 
-    def residual(self, curve: Float[np.ndarray, "level"]) -> float:
+    def residual(self, curve: Float[np.ndarray, "level"], *, lowest_gray: int = 0) -> float:
         """Return the rms of g(G) - ln E - ln dt over the samples used, i.e. the relative error of the light."""
+        used = self._used * (self._gray >= lowest_gray)
         difference = curve[self._gray] - self._log_exposure
-        total = self._used.sum(axis=1, keepdims=True)
-        mean = (self._used * difference).sum(axis=1, keepdims=True) / total
-        freedom = self._used.sum() - len(self._used)
-        squares = float((self._used * (difference - mean) ** 2).sum())
+        total = np.maximum(used.sum(axis=1, keepdims=True), 1.0)
+        mean = (used * difference).sum(axis=1, keepdims=True) / total
+        freedom = used.sum() - int((used.sum(axis=1) > 0).sum())
+        squares = float((used * (difference - mean) ** 2).sum())
         return float(np.sqrt(squares / max(freedom, 1.0)))
 
 
