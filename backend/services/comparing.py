@@ -9,23 +9,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from backend.contract.requests import CreateScan, EditSettings, StartRun
-from backend.domain.errors import UnglareError
+from backend.contract.requests import CreateScan
 from backend.domain.frames import Frame
 from backend.domain.shots import Progress
 from backend.jobs.loading import LoadedScan, load_scan
 from backend.numerics.scoring import Scores
-from backend.services import editing, running, scans
+from backend.services import scans
 from backend.services.contact_sheet import Panel, Picture, Row, contact_sheet, drawn, png
 from backend.services.context import Context
 from backend.services.export_folder import FolderKind, refuse_foreign, whole_folder
-from backend.services.reporting import document_of, report, truth_document
+from backend.services.reporting import report, truth_document
+from backend.services.variants import Variant, present_result, run_variant, touched_fields
 from backend.stages.cloud import Cloud
 from backend.stages.exposures import Exposures
 from backend.stages.fringe_capture import FringeFrames
 from backend.stages.fringe_phase import AbsolutePhase
 from backend.stages.pre_exposure import Preview
-from backend.storage.codec import decode
 
 METHOD = "hdr-fringe"
 COMPARISON = FolderKind("comparison.json", "unglare-comparison")
@@ -140,40 +139,21 @@ def _measure(
     budget_s = earlier[strategy.time_of].light_s if strategy.time_of else None
     if strategy.time_of and budget_s is None:
         return Compared(strategy, f"{strategy.time_of} took no time that could be given to it.")
-    try:
-        _choose(context, scan, strategy, budget_s)
-        state = running.run(context, scan, StartRun(unattended=True), _WHO)
-    except UnglareError as error:
-        return Compared(strategy, error.sentence)
-    if state.job and state.job.error:
-        return Compared(strategy, state.job.error)
+    variant = Variant(strategy.name, strategy.title, _settings(strategy, budget_s))
+    if error := run_variant(context, scan, variant, _TOUCHED, _WHO):
+        return Compared(strategy, error)
     scale = next((c.scale for c in earlier.values() if c.scale), None)
     return _collect(context, scan, strategy, scale)
 
 
-def _choose(context: Context, scan: str, strategy: Strategy, budget_s: float | None) -> None:
-    """Edit the settings that strategies differ in; all others stay as they are."""
+def _settings(strategy: Strategy, budget_s: float | None) -> dict[str, dict[str, Any]]:
     wanted: dict[str, dict[str, Any]] = {s: dict(f) for s, f in strategy.settings.items()}
     if budget_s is not None:
         wanted.setdefault("exposures", {})["budget_s"] = budget_s
-    touched: dict[str, set[str]] = {"exposures": {"budget_s"}}
-    for other in STRATEGIES:
-        for stage, fields in other.settings.items():
-            touched.setdefault(stage, set()).update(fields)
-    for stage, names in touched.items():
-        changes = wanted.get(stage, {})
-        request = EditSettings(
-            changes=changes,
-            reset=tuple(sorted(names - set(changes))),
-            reason=strategy.title,
-            revision=_revision(context, scan),
-        )
-        editing.edit(context, scan, stage, request, _WHO)
+    return wanted
 
 
-def _revision(context: Context, scan: str) -> int:
-    with context.database.reading() as repositories:
-        return repositories.scans.get(scan).revision
+_TOUCHED = touched_fields([{"exposures": {"budget_s": None}}, *(s.settings for s in STRATEGIES)])
 
 
 def _collect(context: Context, scan: str, strategy: Strategy, scale: Scale | None) -> Compared:
@@ -181,14 +161,11 @@ def _collect(context: Context, scan: str, strategy: Strategy, scale: Scale | Non
     with context.database.reading() as repositories:
         loaded = load_scan(repositories, context.registry, scan)
 
-        def result(kind: type) -> Any:
-            return decode(_document(loaded, kind, repositories), kind, context.store)
-
-        preview: Preview = result(Preview)
-        exposures: Exposures = result(Exposures)
-        fringes: FringeFrames = result(FringeFrames)
-        phase: AbsolutePhase = result(AbsolutePhase)
-        cloud: Cloud = result(Cloud)
+        preview = present_result(context, repositories, loaded, Preview)
+        exposures = present_result(context, repositories, loaded, Exposures)
+        fringes = present_result(context, repositories, loaded, FringeFrames)
+        phase = present_result(context, repositories, loaded, AbsolutePhase)
+        cloud = present_result(context, repositories, loaded, Cloud)
     scale = scale or _scale(phase, cloud)
     return Compared(
         strategy=strategy,
@@ -200,13 +177,6 @@ def _collect(context: Context, scan: str, strategy: Strategy, scale: Scale | Non
         panels=_panels(preview, fringes, phase, cloud, scale),
         scale=scale,
     )
-
-
-def _document(loaded: LoadedScan, kind: type, repositories: Any) -> Mapping[str, Any]:
-    for planned in loaded.plan.stages:
-        if planned.stage.output is kind and planned.result is not None:
-            return document_of(repositories, planned.result)
-    raise AssertionError(f"a finished run of {METHOD} has a {kind.__name__}")
 
 
 def _computing_s(loaded: LoadedScan) -> float:

@@ -4,7 +4,6 @@ Needs a rig that knows the truth, and a scene that is smooth: `plane`.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,17 +12,16 @@ from jaxtyping import Bool, Float
 
 from backend.domain.errors import StageUnavailableError
 from backend.domain.rig import RigCalibration, RigFacts
-from backend.jobs.loading import LoadedScan, load_scan
+from backend.jobs.loading import load_scan
 from backend.numerics.camera_model import project
 from backend.numerics.scoring import Truth
 from backend.numerics.uncertainty import NoiseModel
 from backend.services.context import Context
-from backend.services.reporting import document_of, rig_truth
+from backend.services.reporting import rig_truth
+from backend.services.variants import given_result, present_result
 from backend.stages.fringe_phase import AbsolutePhase
 from backend.stages.fusion import AxisPhasors, Phasors
 from backend.stages.rig_geometry import pinhole, projector_from_reference
-from backend.storage.codec import decode
-from backend.storage.repositories import Repositories
 
 TOLERANCE = 0.1
 _WILD = 8.0
@@ -70,10 +68,10 @@ def measure_noise(context: Context, scan: str) -> NoiseReport:
     """
     with context.database.reading() as repositories:
         loaded = load_scan(repositories, context.registry, scan)
-        phase = _result(context, repositories, loaded, AbsolutePhase)
-        phasors = _result(context, repositories, loaded, Phasors)
-        facts = _given(context, loaded, RigFacts)
-        calibration = _given(context, loaded, RigCalibration)
+        phase = present_result(context, repositories, loaded, AbsolutePhase)
+        phasors = present_result(context, repositories, loaded, Phasors)
+        facts = given_result(context, loaded, RigFacts)
+        calibration = given_result(context, loaded, RigCalibration)
     truth = rig_truth(context, loaded, calibration.reference, (calibration.reference,))
     if truth is None:
         raise StageUnavailableError(
@@ -164,20 +162,3 @@ def _compared(
 
 def _rms(values: Float[np.ndarray, "n"]) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _result(context: Context, repositories: Repositories, loaded: LoadedScan, kind: type) -> Any:
-    for planned in loaded.plan.stages:
-        if planned.stage.output is kind and planned.result is not None:
-            document: Mapping[str, Any] = document_of(repositories, planned.result)
-            return decode(document, kind, context.store)
-    raise StageUnavailableError(
-        f"{loaded.title!r} has no {kind.__name__}: run hdr-fringe at least to the phase."
-    )
-
-
-def _given(context: Context, loaded: LoadedScan, kind: type) -> Any:
-    row = loaded.given.get(kind.__name__)
-    if row is None:
-        raise StageUnavailableError(f"{loaded.title!r} has no {kind.__name__}: calibrate the rig.")
-    return decode(row.document, kind, context.store)
