@@ -11,6 +11,7 @@ from fastapi import APIRouter, Depends, FastAPI
 
 from backend.api import (
     artifacts,
+    calibrations,
     docs,
     events,
     health,
@@ -68,7 +69,9 @@ def _everything() -> APIRouter:
     private = APIRouter(
         prefix="/api", dependencies=[Depends(authorised)], responses=docs.PROBLEM_RESPONSES
     )
-    for module in (scans, rig_routes, artifacts, imports, events, health, metrics, docs):
+    for module in (
+        scans, rig_routes, calibrations, artifacts, imports, events, health, metrics, docs,
+    ):  # fmt: skip
         private.include_router(module.router)
     everything = APIRouter()
     everything.include_router(private)

@@ -6,6 +6,7 @@ import typer
 
 from backend.cli import (
     benchmarking,
+    calibrating,
     captures,
     checking,
     comparing,
@@ -28,7 +29,17 @@ application = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (serving, scanning, captures, describing, checking, comparing, reports, benchmarking):
+for group in (
+    serving,
+    scanning,
+    captures,
+    calibrating,
+    describing,
+    checking,
+    comparing,
+    reports,
+    benchmarking,
+):
     group.register(application)
 
 

@@ -10,6 +10,7 @@ import typer
 from backend.domain.errors import InvalidSettingError
 
 if TYPE_CHECKING:
+    from backend.contract.requests import GivenSource
     from backend.services.services import Services
 
 Settings = Annotated[
@@ -19,6 +20,15 @@ Settings = Annotated[
         metavar="STAGE.FIELD=VALUE",
         help="Set one field of a stage's settings, e.g. exposures.budget=fast; JSON or text, "
         "or for a mask the name of a picture or .npy file. Repeatable.",
+    ),
+]
+Given = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--given",
+        metavar="TYPE=SCAN|FOLDER|NUMBER",
+        help="Take a result from another scan, an exported folder or a calibration by its number, instead of the "
+        "rig's newest; TYPE=none takes none. Repeatable.",
     ),
 ]
 RigName = Annotated[
@@ -76,6 +86,10 @@ AsJson = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
 
 
+_ID_LENGTH = 16
+"""Ids of scans are so long; calibrations have short numbers."""
+
+
 def parse_value(text: str) -> Any:
     """Read a value as JSON, as a list of JSON values, or else as text.
 
@@ -122,6 +136,42 @@ def parse_settings(texts: Iterable[str] | None) -> dict[str, dict[str, Any]]:
             )
         settings.setdefault(stage, {})[field] = parse_value(value.strip())
     return settings
+
+
+def parse_given(texts: Iterable[str] | None) -> "dict[str, GivenSource | None]":
+    """Read `TYPE=SCAN|FOLDER|NUMBER|none`, the last one of a type counts.
+
+    Raises
+    ------
+    InvalidSettingError
+        Naming the text that isn't of that form.
+
+    Examples
+    --------
+    >>> parse_given(["Ramp=3", "TableHomography=none"])
+    {'Ramp': GivenSource(calibration=3, scan=None, folder=None), 'TableHomography': None}
+    """
+    given: dict[str, GivenSource | None] = {}
+    for text in texts or ():
+        kind, equals, value = (part.strip() for part in text.partition("="))
+        if not (equals and kind and value):
+            raise InvalidSettingError(
+                f"--given {text} can't be read: write TYPE=SCAN, TYPE=FOLDER, TYPE=NUMBER or TYPE=none, "
+                "e.g. Ramp=3 (unglare calibrations list shows numbers)."
+            )
+        given[kind] = None if value == "none" else _source(value)
+    return given
+
+
+def _source(value: str) -> "GivenSource":
+    from backend.contract.requests import GivenSource
+
+    if value.isdecimal() and len(value) < _ID_LENGTH:
+        return GivenSource(calibration=int(value))
+    folder = Path(value).expanduser()
+    if folder.exists() or len(folder.parts) > 1:
+        return GivenSource(folder=str(folder.absolute()))
+    return GivenSource(scan=value)
 
 
 def parse_rig_options(

@@ -9,6 +9,7 @@ from backend.cli.house import open_services, who
 from backend.cli.options import (
     AsJson,
     DataFolder,
+    Given,
     ProjectorSize,
     Quiet,
     RigName,
@@ -17,6 +18,7 @@ from backend.cli.options import (
     Seed,
     Settings,
     Size,
+    parse_given,
     parse_rig_options,
     parse_settings,
     with_uploads,
@@ -47,6 +49,7 @@ def scan(
         str, typer.Option(help="Measuring method, see unglare methods.")
     ] = "hdr-fringe",
     settings: Settings = None,
+    given: Given = None,
     size: Size = None,
     projector_size: ProjectorSize = None,
     seed: Seed = None,
@@ -76,6 +79,7 @@ def scan(
             name=name,
             preset=preset,
             settings=parse_settings(settings),
+            given=parse_given(given),
         )
         with open_services(data, progress) as services:
             refuse_place(services, out)

@@ -2,10 +2,27 @@
 
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from backend.contract.base import Message
 from backend.domain.states import Verdict
+
+
+class GivenSource(Message):
+    """Where a result comes from that is handed to a scan: exactly one of these."""
+
+    calibration: int | None = None
+    """Number of a calibration."""
+    scan: str | None = None
+    """A scan whose present result is taken."""
+    folder: str | None = None
+    """An export in a folder of the server."""
+
+    @model_validator(mode="after")
+    def _one(self) -> "GivenSource":
+        if sum(x is not None for x in (self.calibration, self.scan, self.folder)) != 1:
+            raise ValueError("name exactly one of calibration, scan and folder")
+        return self
 
 
 class CreateScan(Message):
@@ -20,6 +37,8 @@ class CreateScan(Message):
     preset: str | None = None
     settings: dict[str, dict[str, Any]] = {}
     """Recipe: `{stage: {field: value}}`, on top of defaults and preset."""
+    given: dict[str, GivenSource | None] = {}
+    """Results to hand over, `{type: source}`, instead of the rig's calibrations; None: not even those."""
 
 
 class EditSettings(Message):

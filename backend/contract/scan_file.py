@@ -73,6 +73,8 @@ class WrittenGiven(_Part):
     hash: str
     document: dict[str, Any] | None
     """Arrays are written out; None: it was made of imported frames, which `capture.json` holds."""
+    origin: dict[str, Any] | None = None
+    """Where it came from if it was an operator's choice or a calibration."""
 
 
 class WrittenDecision(_Part):
@@ -130,6 +132,8 @@ class ScanFile(_Part):
     """Who the devices are that captured, by their names in the rig."""
     metrics: dict[str, Any]
     """Points, times and, where the rig knew it, the comparison with the truth."""
+    results: dict[str, WrittenGiven] = {}
+    """By stage, the results that can be handed to other scans."""
     arrays: dict[str, str] = {}
     """Files of the arrays that settings refer to, e.g. painted masks, by the hash in the setting."""
     files: dict[str, str]

@@ -107,6 +107,49 @@ class StageState(Message):
     duration_s: float | None = None
     started: datetime | None = None
     result_hash: str | None = None
+    can_keep: bool = False
+    """True: later scans with this rig could use the result, if it is kept as a calibration."""
+    kept: int | None = None
+    """Number of the calibration that this result is kept as."""
+
+
+class HandedView(Message):
+    """A result that an operator may hand to the scan: what it is now, and which stages it reaches."""
+
+    type: str
+    title: str
+    name: str
+    """The stage that it replaces, or the type itself where no stage makes it."""
+    stages: tuple[str, ...]
+    """The stage that it replaces, or those that read it."""
+    sentence: str | None = None
+    """Where it comes from; None: nothing is handed over."""
+    calibration: int | None = None
+    """Number of the calibration, if it is one."""
+    result_hash: str | None = None
+
+
+class CalibrationView(Message):
+    """A result that is kept for a rig; later scans get the newest one of its type."""
+
+    number: int
+    type: str
+    title: str
+    rig: str
+    scan: str
+    scan_name: str
+    stage: str
+    who: str
+    when: datetime
+    result_hash: str
+    facts_hash: str
+    """Content hash of the rig's facts: a scan gets it only if its rig has the same."""
+    calibration_hash: str | None
+    """The same of its geometry; None: the rig had none."""
+    newest: bool
+    """True: this is what the next scan with such a rig gets."""
+    withdrawn: datetime | None = None
+    withdrawn_by: str | None = None
 
 
 class JobView(Message):
@@ -159,6 +202,8 @@ class ScanState(Message):
     status: str
     stages: tuple[StageState, ...]
     job: JobView | None
+    handed: tuple[HandedView, ...] = ()
+    """Results that may be handed over, e.g. calibrations of the rig."""
     undo: str | None
     """What undo would take back, as a sentence; None if there is nothing."""
 

@@ -53,6 +53,23 @@ class Method:
         """For each stage, where its inputs come from."""
         return {s.name: self._wire(s) for s in self.stages}
 
+    @cached_property
+    def handed(self) -> Mapping[str, str]:
+        """Results that an operator may hand to a scan, by type: under which name they are given.
+
+        That is the stage that the result replaces, or the type itself where no stage makes it. Facts and
+        calibration come from the rig, and what an importer makes of frames comes with the frames.
+        """
+        places: dict[str, str] = {}
+        for kind in self.given:
+            makers = [s.name for s in self.stages if s.output is kind]
+            if kind not in (RigFacts, RigCalibration) and not {
+                kind.__name__,
+                *makers,
+            } & set(self.importers):
+                places[kind.__name__] = makers[0] if makers else kind.__name__
+        return places
+
     def stage(self, name: str) -> Stage:
         """Return the stage of that name; KeyError if there is none."""
         for s in self.stages:

@@ -7,7 +7,7 @@ job continues where it was, and an edit made meanwhile counts.
 import logging
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
@@ -18,9 +18,11 @@ from backend.contract.events import Event, FrameCaptured, JobProgress, ScanChang
 from backend.devices.protocols import Frame as DeviceFrame
 from backend.devices.protocols import KnowsTruth, Rig
 from backend.domain.errors import CancelledError, UnglareError
+from backend.domain.method import Method
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.stage import Stage
 from backend.domain.states import JobStatus, Level, Verdict
+from backend.jobs.calibrations import hand_over
 from backend.jobs.capture import CaptureSession
 from backend.jobs.control import JobControl, Live
 from backend.jobs.journal import DatabaseJournal
@@ -91,8 +93,18 @@ def compute_inline(shop: Workshop) -> Compute:
     return compute
 
 
-def store_rig(repositories: Repositories, store: ArtifactStore, scan: str, rig: RigGiven) -> None:
-    """Hand a rig's facts, and its calibration if it has one, to a scan; once for all."""
+def store_rig(
+    repositories: Repositories,
+    store: ArtifactStore,
+    method: Method,
+    scan: str,
+    rig: RigGiven,
+    declined: Collection[str] = (),
+) -> None:
+    """Hand a rig's facts, and its calibration if it has one, to a scan, and what is kept for the rig; once for all.
+
+    `declined` are types of kept results that the scan doesn't want.
+    """
     repositories.scans.lock(scan)
     known = repositories.given.of(scan)
     for kind, result in ((RigFacts, rig.facts), (RigCalibration, rig.calibration)):
@@ -100,6 +112,8 @@ def store_rig(repositories: Repositories, store: ArtifactStore, scan: str, rig: 
             document = encode(result, store)
             name = kind.__name__
             repositories.given.add(scan, name, name, document, content_hash(document))
+    if RigFacts.__name__ not in known:
+        hand_over(repositories, method, scan, declined)
 
 
 @dataclass(frozen=True)
@@ -182,7 +196,7 @@ class JobExecution:
         """Do what `create_scan` couldn't because the rig was busy."""
         rig = self._shop.rigs.given(scan.row.rig, scan.row.rig_options)
         with self._shop.database.transaction() as repositories:
-            store_rig(repositories, self._shop.store, scan.row.id, rig)
+            store_rig(repositories, self._shop.store, scan.method, scan.row.id, rig)
 
     # one stage
 

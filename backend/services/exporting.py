@@ -33,6 +33,7 @@ from backend.services.export_folder import (
     safe_name,
     whole_folder,
 )
+from backend.services.handed import takers
 from backend.services.ply import ply_parts
 from backend.services.portable import written_out
 from backend.services.reporting import load_cloud, report
@@ -86,7 +87,8 @@ def export_scan(
             name: _written_given(target, content, name, context.store) for name in content.given
         }
         arrays = _write_arrays(target, content, context.store)
-        document = content.scan_file(context, given, metrics, arrays, dict(target.hashes))
+        results = _written_results(target, content, context)
+        document = content.scan_file(context, given, results, metrics, arrays, dict(target.hashes))
         target.write_json(SCAN_FILE, document.model_dump(mode="json"))
         names = sorted(target.hashes)
     with context.database.transaction() as repositories:
@@ -167,6 +169,7 @@ class _Content:
         self,
         context: Context,
         given: dict[str, WrittenGiven],
+        results: dict[str, WrittenGiven],
         metrics: dict[str, Any],
         arrays: dict[str, str],
         files: dict[str, str],
@@ -198,6 +201,7 @@ class _Content:
             audit=tuple(_written_audit(a) for a in self.audit),
             devices={name: d for run in self.runs.values() for name, d in run.device.items()},
             metrics=metrics,
+            results=results,
             arrays=arrays,
             files=files,
         )
@@ -276,14 +280,41 @@ def _written_given(
     target: ExportFolder, content: _Content, name: str, store: ArtifactStore
 ) -> WrittenGiven:
     row = content.given[name]
+    imported = name in content.loaded.method.importers
+    document = None if imported else _written_document(target, row.document, store)
+    origin = dict(row.origin) if row.origin else None
+    return WrittenGiven(type=row.type_name, hash=row.hash, document=document, origin=origin)
 
+
+def _written_results(
+    target: ExportFolder, content: _Content, context: Context
+) -> dict[str, WrittenGiven]:
+    """Write the results that can be handed to other scans, whole."""
+    wanted = takers(context.registry)
+    with context.database.reading() as repositories:
+        found = {
+            p.name: (p.stage.output.__name__, repositories.runs.get(p.run.id).document, p.run.hash)
+            for p in content.loaded.plan.stages
+            if p.run and p.stage.output.__name__ in wanted
+        }
+    return {
+        stage: WrittenGiven(
+            type=kind, hash=hash, document=_written_document(target, document, context.store)
+        )
+        for stage, (kind, document, hash) in found.items()
+        if document is not None and hash is not None
+    }
+
+
+def _written_document(
+    target: ExportFolder, document: Mapping[str, Any], store: ArtifactStore
+) -> dict[str, Any]:
     def write(hash: str, array: Array) -> str:
         target.write_array(f"given/{hash}.npy", array)
         return f"given/{hash}.npy"
 
-    imported = name in content.loaded.method.importers
-    document = None if imported else written_out(row.document, store, write)
-    return WrittenGiven(type=row.type_name, hash=row.hash, document=document)
+    written: dict[str, Any] = written_out(document, store, write)
+    return written
 
 
 def _written_settings(state: StageState) -> dict[str, WrittenSetting]:

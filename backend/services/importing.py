@@ -84,7 +84,12 @@ class Importer:
             repositories.scans.add(row)
             for result in given:
                 repositories.given.add(
-                    scan, result.name, result.type_name, result.document, result.hash
+                    scan,
+                    result.name,
+                    result.type_name,
+                    result.document,
+                    result.hash,
+                    result.origin,
                 )
             for frame in journal:
                 repositories.frames.add(frame)
@@ -325,7 +330,8 @@ class _ImportPlan:
                 continue
             document = read_back(given.document, store, self.folder.folder)
             self._check(name, document, given.hash, store)
-            rows.append(GivenRow(name, given.type, document, content_hash(document)))
+            hash = content_hash(document)
+            rows.append(GivenRow(name, given.type, document, hash, given.origin))
         return rows
 
     def _check(self, name: str, document: dict[str, Any], hash: str, store: ArtifactStore) -> None:

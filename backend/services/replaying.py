@@ -181,7 +181,9 @@ def _copy(loaded: LoadedScan, journal: Sequence[FrameRow], database: Database) -
     with database.transaction() as repositories:
         repositories.scans.add(row)
         for given in loaded.given.values():
-            repositories.given.add(row.id, given.name, given.type_name, given.document, given.hash)
+            repositories.given.add(
+                row.id, given.name, given.type_name, given.document, given.hash, given.origin
+            )
         for frame in journal:
             if (frame.stage, frame.take) in takes:
                 repositories.frames.add(replace(frame, take=FIRST_TAKE))

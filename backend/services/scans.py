@@ -8,9 +8,11 @@ from backend.contract.requests import CreateScan
 from backend.contract.scans import AuditEntry, ScanState, ScanSummary
 from backend.domain.errors import RigBusyError, UnglareError
 from backend.domain.ids import new_id
+from backend.domain.method import Method
 from backend.jobs.edits import check_recipe, preset_values
 from backend.jobs.execution import store_rig
 from backend.jobs.rigs import RigGiven
+from backend.services.calibrations import give_from, require_handed
 from backend.services.context import Context
 from backend.services.states import scan_state, scan_summary
 from backend.services.telling import announce
@@ -31,12 +33,16 @@ def create_scan(context: Context, request: CreateScan, who: str) -> ScanState:
         If there is no such method or rig.
     InvalidSettingError
         If the preset, a setting of the recipe or an option of the rig can't be used.
+    ConflictError
+        If the method takes no such result from outside.
     DeviceError
         If a device of the rig refuses at once.
     """
     method = context.registry.get(request.method)
     preset_values(method, request.preset)
     recipe = check_recipe(method, request.preset, request.settings, context.store.__contains__)
+    for type_name in request.given:
+        require_handed(method, type_name)
     asked, rig = _ask_rig(context, request)
     row = ScanRow(
         id=new_id(),
@@ -52,8 +58,6 @@ def create_scan(context: Context, request: CreateScan, who: str) -> ScanState:
     )
     with context.database.transaction() as repositories:
         repositories.scans.add(row)
-        if rig is not None:
-            store_rig(repositories, context.store, row.id, rig)
         sentence = f"Scan made: {method.title} with rig {request.rig}."
         details = {
             "method": method.name,
@@ -61,11 +65,17 @@ def create_scan(context: Context, request: CreateScan, who: str) -> ScanState:
             "rig_options": dict(request.rig_options),
             "preset": request.preset,
             "settings": recipe,
+            "given": {t: s.model_dump() if s else None for t, s in request.given.items()},
         }
         repositories.audit.add(row.id, who, "created", None, sentence, details)
+        for type_name, source in request.given.items():
+            if source is not None:
+                give_from(context, repositories, method, row.id, type_name, source)
+        if rig is not None:
+            store_rig(repositories, context.store, method, row.id, rig, request.given)
         state = scan_state(context, repositories, row.id)
     if asked is not None and rig is None:
-        asked.add_done_callback(lambda answer: _store_late(context, row.id, answer))
+        asked.add_done_callback(lambda answer: _store_late(context, method, row.id, answer))
     return announce(context, state)
 
 
@@ -109,21 +119,27 @@ def audit_trail(context: Context, scan: str) -> tuple[AuditEntry, ...]:
 def _ask_rig(
     context: Context, request: CreateScan
 ) -> tuple[Future[RigGiven] | None, RigGiven | None]:
-    """Return the question and, if it came at once, the answer."""
+    """Return the question and, if it came at once, the answer.
+
+    Where a calibration is declined, the answer is waited for: with it the calibrations are handed over.
+    """
+    declines = None in request.given.values()
     try:
         asked = context.rigs.ask(request.rig, request.rig_options)
-        return asked, asked.result(timeout=context.rig_patience_s)
+        return asked, asked.result(timeout=None if declines else context.rig_patience_s)
     except RigBusyError:
+        if declines:
+            raise
         return None, None
     except TimeoutError:
         return asked, None
 
 
-def _store_late(context: Context, scan: str, answer: Future[RigGiven]) -> None:
+def _store_late(context: Context, method: Method, scan: str, answer: Future[RigGiven]) -> None:
     """Hand a rig's facts to a scan that was made before they were known."""
     try:
         with context.database.transaction() as repositories:
-            store_rig(repositories, context.store, scan, answer.result())
+            store_rig(repositories, context.store, method, scan, answer.result())
             revision = repositories.scans.get(scan).revision
     except UnglareError as error:
         # The first run asks again, and tells the operator.

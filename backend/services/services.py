@@ -12,6 +12,7 @@ from backend.contract.requests import (
     CreateScan,
     Decide,
     EditSettings,
+    GivenSource,
     RedoStage,
     StartRun,
     UndoEdit,
@@ -20,6 +21,7 @@ from backend.contract.rigs import RigCheck, RigOffer, RigView
 from backend.contract.scans import (
     ArtifactRef,
     AuditEntry,
+    CalibrationView,
     PixelLevels,
     ScanState,
     ScanSummary,
@@ -32,6 +34,7 @@ from backend.jobs.rigs import RigPool
 from backend.jobs.runner import Runner
 from backend.methods import Registry
 from backend.services import (
+    calibrations,
     editing,
     exporting,
     importing,
@@ -209,6 +212,28 @@ class Services:
     def undo(self, scan: str, request: UndoEdit, who: str) -> ScanState:
         """Take back the last edit; see `editing.undo`."""
         return editing.undo(self.context, scan, request, who)
+
+    # calibrations
+
+    def keep(self, stage_run: str, who: str) -> CalibrationView:
+        """Keep a result for its rig; see `calibrations.keep`."""
+        return calibrations.keep(self.context, stage_run, who)
+
+    def withdraw(self, number: int, who: str) -> CalibrationView:
+        """Take a calibration back; see `calibrations.withdraw`."""
+        return calibrations.withdraw(self.context, number, who)
+
+    def calibrations(self, rig: str | None = None) -> tuple[CalibrationView, ...]:
+        """Return what was ever kept for a rig (None: for any), newest first."""
+        return calibrations.listed(self.context, rig)
+
+    def give(self, scan: str, type_name: str, source: GivenSource, who: str) -> ScanState:
+        """Hand a result to a scan; see `calibrations.give`."""
+        return calibrations.give(self.context, scan, type_name, source, who)
+
+    def take_away(self, scan: str, type_name: str, who: str) -> ScanState:
+        """Take a handed-over result away; see `calibrations.take_away`."""
+        return calibrations.take_away(self.context, scan, type_name, who)
 
     # runs
 

@@ -1,5 +1,8 @@
 """The state of a scan, whole, put together from its plan, its runs and its job. Nothing here is stored."""
 
+from collections.abc import Mapping
+from functools import cached_property
+
 from backend.contract.scans import (
     CheckView,
     DecisionView,
@@ -11,15 +14,26 @@ from backend.contract.scans import (
 )
 from backend.domain.stage import Stage
 from backend.domain.states import JobStatus, StageStatus, Verdict
+from backend.jobs.calibrations import rig_identity
 from backend.jobs.edits import last_group
-from backend.jobs.loading import LoadedScan, load_scan
+from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
 from backend.jobs.plan import RIG, PlannedStage, gate_holds, run_level
 from backend.jobs.views import job_view
 from backend.services.context import Context
 from backend.services.fields import ShownResult, point_count, shown_result
+from backend.services.handed import handed_views, takers
 from backend.services.words import shown_value
 from backend.storage.repositories import Repositories
-from backend.storage.rows import EditKind, EditRow, GivenRow, JobRow, RunRow, RunStatus, ScanRow
+from backend.storage.rows import (
+    CalibrationRow,
+    EditKind,
+    EditRow,
+    GivenRow,
+    JobRow,
+    RunRow,
+    RunStatus,
+    ScanRow,
+)
 
 _DONE = (StageStatus.DONE, StageStatus.ACCEPTED, StageStatus.GIVEN)
 
@@ -75,6 +89,7 @@ class Assembly:
             status=self._scan_status([stage.status for stage in stages]),
             stages=stages,
             job=self._job,
+            handed=handed_views(self._scan.method, self._scan.given),
             undo=undo_sentence(self._scan),
         )
 
@@ -107,6 +122,8 @@ class Assembly:
             duration_s=attempt.duration_s if attempt else None,
             started=attempt.started if attempt else None,
             result_hash=planned.result.hash if planned.result else None,
+            can_keep=planned.run is not None and self._can_keep(planned.stage),
+            kept=self._kept_as(planned),
         )
 
     def _status(self, planned: PlannedStage) -> StageStatus:
@@ -163,6 +180,27 @@ class Assembly:
             document = self._repositories.runs.documents([result.id])[result.id]
         return shown_result(stage, document or {}, self._context.store)
 
+    # calibrations
+
+    def _can_keep(self, stage: Stage) -> bool:
+        takes = stage.output.__name__ in takers(self._context.registry)
+        return takes and self._scan.row.rig != NO_RIG
+
+    @cached_property
+    def _newest(self) -> Mapping[str, CalibrationRow]:
+        """The calibrations that a new scan with this rig would get, by type."""
+        identity = rig_identity(self._scan.row.rig, self._scan.given)
+        kept = [s.output.__name__ for s in self._scan.method.stages if self._can_keep(s)]
+        if identity is None or not kept:
+            return {}
+        return self._repositories.calibrations.newest(kept, **identity._asdict())
+
+    def _kept_as(self, planned: PlannedStage) -> int | None:
+        newest = self._newest.get(planned.stage.output.__name__)
+        if newest is None or planned.run is None or newest.hash != planned.run.hash:
+            return None
+        return newest.sequence
+
     # words
 
     def _message(self, planned: PlannedStage, status: StageStatus) -> str:
@@ -176,7 +214,7 @@ class Assembly:
             case StageStatus.FAILED:
                 return self._error(planned)
             case StageStatus.GIVEN:
-                return "Handed over with the scan."
+                return _origin(planned)
             case StageStatus.ACCEPTED:
                 return _decided(planned, "Accepted")
             case StageStatus.REJECTED:
@@ -268,6 +306,12 @@ def _found(planned: PlannedStage) -> str:
         return f"Done in {run.duration_s or 0:.1f} s."
     sentence = str(gravest[0]["sentence"]).removesuffix(".")
     return f"{sentence[:1].upper()}{sentence[1:]}."
+
+
+def _origin(planned: PlannedStage) -> str:
+    given = planned.given
+    said = (given.origin or {}).get("sentence") if given else None
+    return str(said or "Handed over with the scan.")
 
 
 def _decided(planned: PlannedStage, verb: str) -> str:

@@ -60,6 +60,36 @@ class GivenRow:
     type_name: str
     document: dict[str, Any]
     hash: str
+    origin: Mapping[str, Any] | None = None
+    """Where it comes from if neither the rig nor imported frames: `sentence`, and `calibration`, `scan` or `folder`."""
+
+
+@dataclass(frozen=True)
+class CalibrationRow:
+    """A stage's result that is kept for a rig: later scans get the newest one of its type.
+
+    It holds for the rig that it was made with: the same name, the same facts, the same geometry.
+    """
+
+    sequence: int
+    """1, 2, 3 ...: what a person calls it."""
+    type_name: str
+    rig: str
+    facts_hash: str
+    """Content hash of the rig's `RigFacts`."""
+    calibration_hash: str | None
+    """Content hash of the rig's `RigCalibration`; None: it had none."""
+    document: dict[str, Any]
+    hash: str
+    scan: str
+    """The scan that it was made in."""
+    stage: str
+    run: str
+    who: str
+    when: datetime
+    withdrawn: datetime | None = None
+    """When it was taken back: no later scan gets it."""
+    withdrawn_by: str | None = None
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ erDiagram
     scans ||--o{ runs : ""
     scans ||--o{ frames : "journal"
     scans ||--o{ audit : ""
+    runs ||--o{ calibrations : "kept for the rig"
     jobs ||--o{ runs : ""
     runs ||--o{ decisions : ""
 ```
@@ -87,6 +88,34 @@ class Given(Base):
     type_name: Mapped[str]
     document: Mapped[dict[str, Any]] = mapped_column(ExactJson)
     hash: Mapped[str]
+    origin: Mapped[dict[str, Any] | None] = mapped_column(ExactJsonOrNull)
+
+
+class Calibration(Base):
+    """See `CalibrationRow`."""
+
+    __tablename__ = "calibrations"
+    __table_args__ = (
+        CheckConstraint("(withdrawn IS NULL) = (withdrawn_by IS NULL)", name="withdrawn"),
+        Index(None, "rig", "type_name"),
+        Index(None, "scan"),
+        {"sqlite_autoincrement": True},
+    )
+
+    sequence: Mapped[int] = mapped_column(SEQUENCE, primary_key=True)
+    type_name: Mapped[str]
+    rig: Mapped[str]
+    facts_hash: Mapped[str]
+    calibration_hash: Mapped[str | None]
+    document: Mapped[dict[str, Any]] = mapped_column(ExactJson)
+    hash: Mapped[str]
+    scan: Mapped[str] = mapped_column(ForeignKey("scans.id"))
+    stage: Mapped[str]
+    run: Mapped[str] = mapped_column(ForeignKey("runs.id"))
+    who: Mapped[str]
+    when: Mapped[datetime]
+    withdrawn: Mapped[datetime | None]
+    withdrawn_by: Mapped[str | None]
 
 
 class Edit(Base):

@@ -16,7 +16,16 @@ from backend.domain.ids import new_id
 from backend.domain.states import JobStatus, Level, Verdict
 from backend.storage.database import Database
 from backend.storage.repositories import Repositories
-from backend.storage.rows import EditKind, EditRow, FrameRow, JobRow, RunStatus, ScanRow
+from backend.storage.rows import (
+    CalibrationRow,
+    EditKind,
+    EditRow,
+    FrameRow,
+    GivenRow,
+    JobRow,
+    RunStatus,
+    ScanRow,
+)
 from backend.storage.tables import APPEND_ONLY
 
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -541,3 +550,69 @@ def test_rows_that_record_what_happened_stay(grown: Database, table: str, change
     count = f"SELECT count(*) FROM {table} WHERE stage IS NULL OR stage <> 'other'"
     with grown.engine.connect() as connection:
         assert connection.scalar(text(count)) == 1
+
+
+# --- calibrations ----------------------------------------------------------------------------------
+
+
+def keep(r: Repositories, scan: str, run: str, **changes: Any) -> CalibrationRow:
+    values: dict[str, Any] = {
+        "type_name": "TableHomography",
+        "rig": "simulated",
+        "facts_hash": "f" * 64,
+        "calibration_hash": None,
+        "document": {"rows": [1.0, -0.0]},
+        "hash": "d" * 64,
+        "stage": "table",
+        "who": "ada",
+    }
+    return r.calibrations.add(scan=scan, run=run, **(values | changes))
+
+
+def test_a_calibration_comes_back_as_it_was_kept(database: Database, scan: str) -> None:
+    with database.transaction() as r:
+        kept = keep(r, scan, r.runs.start(scan, "table", "k", 1))
+    with database.reading() as r:
+        assert r.calibrations.get(kept.sequence) == kept
+        assert r.calibrations.of_rig("simulated") == (kept,)
+        assert r.calibrations.of_rig() == (kept,)
+        assert r.calibrations.of_rig("another") == ()
+        with pytest.raises(NotFoundError, match="no calibration 999"):
+            r.calibrations.get(999)
+
+
+def test_the_newest_one_that_fits_counts_until_it_is_withdrawn(
+    database: Database, scan: str
+) -> None:
+    def newest(**changes: Any) -> dict[str, int]:
+        rig: dict[str, Any] = {"rig": "simulated", "facts_hash": "f" * 64, "calibration_hash": None}
+        with database.reading() as r:
+            found = r.calibrations.newest(["TableHomography", "Ramp"], **(rig | changes))
+        return {name: row.sequence for name, row in found.items()}
+
+    with database.transaction() as r:
+        run = r.runs.start(scan, "table", "k", 1)
+        old, new = keep(r, scan, run), keep(r, scan, run, hash="e" * 64)
+        ramp = keep(r, scan, run, type_name="Ramp", calibration_hash="c" * 64)
+        keep(r, scan, run, type_name="Other")
+    assert newest() == {"TableHomography": new.sequence}
+    assert newest(calibration_hash="c" * 64) == {"Ramp": ramp.sequence}
+    assert newest(rig="another") == newest(facts_hash="0" * 64) == {}
+    with database.transaction() as r:
+        first = r.calibrations.withdraw(new.sequence, "bob")
+        again = r.calibrations.withdraw(new.sequence, "eve")
+    assert first == again
+    assert first.withdrawn_by == "bob"
+    assert newest() == {"TableHomography": old.sequence}
+
+
+def test_a_given_result_tells_its_origin_and_can_be_taken_away(
+    database: Database, scan: str
+) -> None:
+    with database.transaction() as r:
+        r.given.add(scan, "Ramp", "Ramp", {"a": 1}, "1" * 64, {"calibration": 3})
+    with database.transaction() as r:
+        taken = r.given.remove(scan, "Ramp")
+        assert r.given.remove(scan, "Ramp") is None
+        assert r.given.of(scan) == {}
+    assert taken == GivenRow("Ramp", "Ramp", {"a": 1}, "1" * 64, {"calibration": 3})

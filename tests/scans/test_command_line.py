@@ -75,6 +75,16 @@ def test_a_scan_answers_with_one_json_object(unglare, tmp_path):
     assert (tmp_path / "out/maps/fringe_phase.projector_px.left.npy").is_file()
 
 
+def test_calibrations_are_listed_and_what_is_not_there_is_named(unglare):
+    assert unglare("calibrations", "list", "--json").answer == {"calibrations": []}
+    done = unglare("calibrations", "withdraw", "3")
+    assert (done.status, "no calibration 3" in done.err) == (1, True)
+    done = unglare("calibrations", "keep", "no-scan", "zones")
+    assert (done.status, "no scan 'no-scan'" in done.err) == (1, True)
+    done = unglare("scan", *SMALL, "--given", "Ramp=3")
+    assert (done.status, "hdr-fringe takes no Ramp from outside" in done.err) == (1, True)
+
+
 def test_an_exported_scan_is_imported_with_the_same_cloud_and_replayed(unglare, tmp_path):
     scanned = unglare("scan", *SMALL, "--out", tmp_path / "out", "--frames", "--json").answer
     elsewhere = ("--data", tmp_path / "elsewhere")

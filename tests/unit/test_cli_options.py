@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backend.cli.options import parse_rig_options, parse_settings, parse_value, with_uploads
+from backend.cli.options import (
+    parse_given,
+    parse_rig_options,
+    parse_settings,
+    parse_value,
+    with_uploads,
+)
+from backend.contract.requests import GivenSource
 from backend.domain.errors import InvalidSettingError
 from tests.scans.toy_house import House, data_folder, inline_house
 
@@ -65,6 +72,23 @@ def test_a_value_may_hold_equals_signs_and_dots():
 def test_a_setting_of_another_form_is_named(text):
     with pytest.raises(InvalidSettingError, match=r"STAGE\.FIELD=VALUE"):
         parse_settings([text])
+
+
+def test_results_come_from_a_scan_a_folder_or_a_calibration(tmp_path: Path) -> None:
+    texts = ["A=3", f"B={tmp_path}", "C=01m2k8v0q4x9h3tz", "D=none", "E=out/last", "A=4"]
+    assert parse_given(texts) == {
+        "A": GivenSource(calibration=4),
+        "B": GivenSource(folder=str(tmp_path)),
+        "C": GivenSource(scan="01m2k8v0q4x9h3tz"),
+        "D": None,
+        "E": GivenSource(folder=str(Path("out/last").absolute())),
+    }
+
+
+@pytest.mark.parametrize("text", ["Ramp", "=3", "Ramp="])
+def test_a_given_result_of_another_form_is_named(text: str) -> None:
+    with pytest.raises(InvalidSettingError, match=r"TYPE=SCAN"):
+        parse_given([text])
 
 
 def test_only_options_that_are_given_reach_the_rig():

@@ -9,6 +9,7 @@ from datetime import datetime
 from sqlalchemy.orm import Session
 
 from backend.storage.repositories.audit import AuditTrail
+from backend.storage.repositories.calibrations import Calibrations
 from backend.storage.repositories.edits import Edits
 from backend.storage.repositories.frames import Frames
 from backend.storage.repositories.jobs import Jobs
@@ -25,6 +26,7 @@ class Repositories:
     def __init__(self, session: Session, now: Callable[[], datetime]) -> None:
         self.scans = Scans(session)
         self.given = GivenResults(session)
+        self.calibrations = Calibrations(session, now)
         self.edits = Edits(session)
         self.runs = Runs(session, now)
         self.decisions = Decisions(session, now)

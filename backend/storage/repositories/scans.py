@@ -77,15 +77,36 @@ class GivenResults:
         self._session = session
 
     def add(
-        self, scan: str, name: str, type_name: str, document: Mapping[str, Any], hash: str
+        self,
+        scan: str,
+        name: str,
+        type_name: str,
+        document: Mapping[str, Any],
+        hash: str,
+        origin: Mapping[str, Any] | None = None,
     ) -> None:
         """Hand over one encoded result, under a stage's or a type's name."""
         self._session.add(
             tables.Given(
-                scan=scan, name=name, type_name=type_name, document=dict(document), hash=hash
+                scan=scan,
+                name=name,
+                type_name=type_name,
+                document=dict(document),
+                hash=hash,
+                origin=dict(origin) if origin else None,
             )
         )
         self._session.flush()
+
+    def remove(self, scan: str, name: str) -> GivenRow | None:
+        """Take a given result away and return it; None if there is none. Audited by whoever asks for it."""
+        record = self._session.get(tables.Given, (scan, name))
+        if record is None:
+            return None
+        row = as_row(GivenRow, record)
+        self._session.delete(record)
+        self._session.flush()
+        return row
 
     def of(self, scan: str) -> dict[str, GivenRow]:
         """Return the scan's given results by name."""
