@@ -9,14 +9,30 @@ from backend.domain.rig import RigCalibration, RigFacts
 from backend.stages.camera_response import camera_response
 from backend.stages.interval import interval
 from backend.stages.linearise import linearise
+from backend.stages.mirror_cloud import mirror_cloud
 from backend.stages.ramp import Ramp, ramp
+from backend.stages.reflect_capture import reflect_capture, reflect_frames
+from backend.stages.screen_phase import screen_phase
+from backend.stages.slopes import slopes
 from backend.stages.stack import import_stack, stack
+from backend.stages.surface import surface
 
 METHOD = Method(
     name="fringe-reflection",
     title="Fringe reflection",
     doc="Measures mirrors: fringes on a screen, seen through the part, tell the slope of every point.",
-    stages=(stack, camera_response, ramp, interval, linearise),
+    stages=(
+        stack,
+        camera_response,
+        ramp,
+        interval,
+        linearise,
+        reflect_capture,
+        screen_phase,
+        slopes,
+        surface,
+        mirror_cloud,
+    ),
     given=(RigFacts, RigCalibration, Ramp),
-    importers={"stack": import_stack},
+    importers={"reflect_capture": reflect_frames, "stack": import_stack},
 )

@@ -40,18 +40,23 @@ class Surface(NamedTuple):
     coefficients: Float64[np.ndarray, "_terms"]
     """In [mm], in the order of `polynomial_terms.powers`: 1 x x^2 y xy y^2 ..."""
 
+    @property
+    def order(self) -> int:
+        """Order of the polynomial."""
+        return order_of(self.coefficients.size)
+
     def heights(
         self, x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]
     ) -> Float64[np.ndarray, "n"]:
         """Return z in [mm]."""
-        terms = height_terms(x, y, order_of(self.coefficients.size))
+        terms = height_terms(x, y, self.order)
         return np.asarray(terms @ self.coefficients)
 
     def slopes(
         self, x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]
     ) -> Float64[np.ndarray, "n 2"]:
         """Return dz/dx and dz/dy."""
-        by_x, by_y = slope_terms(x, y, order_of(self.coefficients.size))
+        by_x, by_y = slope_terms(x, y, self.order)
         return np.stack([by_x @ self.coefficients, by_y @ self.coefficients], axis=1)
 
 
@@ -217,7 +222,6 @@ class MirrorSlopes(NamedTuple):
     """The pose, after alignment."""
     tilt_rad: float
     """By how much alignment turned the mirror in all."""
-    rounds: int
 
 
 _MOST_ROUNDS = 20
@@ -266,7 +270,7 @@ def solve_slopes(
     chosen = chosen[:: max(1, chosen.size // _FIT_POINTS)]
     sample = View(view.directions[chosen], view.screen_mm[chosen], view.screen_origin_mm)
     surface, weights, tilt_rad = start, np.ones((chosen.size, 2)), 0.0
-    for done in range(1, _MOST_ROUNDS + 1):
+    for _ in range(_MOST_ROUNDS):
         points, slopes = _slopes_of(sample, pose, surface)
         met = np.isfinite(slopes).all(axis=1)
         _require_points(met, "meet the mirror's surface")
@@ -289,7 +293,7 @@ def solve_slopes(
             "check the poses of screen and mirror"
         )
     points, slopes = _slopes_of(view, pose, surface)
-    return MirrorSlopes(points, slopes, surface, pose, tilt_rad, done)
+    return MirrorSlopes(points, slopes, surface, pose, tilt_rad)
 
 
 def _slopes_of(
@@ -325,7 +329,7 @@ def _aligned(
     pose = RigidTransform(turn @ pose.R, turn @ (pose.t_mm - pivot) + pivot)
     turned = Surface(surface.coefficients.copy())
     turned.coefficients[1] += alignment.slopes[0] - slopes[0]
-    turned.coefficients[order_of(surface.coefficients.size) + 1] += alignment.slopes[1] - slopes[1]
+    turned.coefficients[surface.order + 1] += alignment.slopes[1] - slopes[1]
     turned.coefficients[0] += pivot[2] - turned.heights(at[:1], at[1:])[0]
     moved = 0.0
     if alignment.distance_mm is not None:

@@ -20,7 +20,7 @@ def powers(order: int) -> tuple[tuple[int, int], ...]:
 
 def order_of(terms: int) -> int:
     """Return the order whose polynomials have so many terms: 6 terms are order 2."""
-    return int(round((float(np.sqrt(8 * terms + 1)) - 3) / 2))
+    return round((float(np.sqrt(8 * terms + 1)) - 3) / 2)
 
 
 def height_terms(

@@ -304,7 +304,6 @@ def phase_ripple_rad(
     share: Float32[np.ndarray, "h w"],
     *,
     periods: float,
-    offset_rad: float,
     harmonic: int,
 ) -> float:
     r"""Measure the error of one period count's phase that repeats `harmonic` times per fringe.
@@ -315,8 +314,8 @@ def phase_ripple_rad(
         Phase of that period count.
     share
         Position found by finer fringes (or, for the finest, smoothed); NaN where unknown.
-    periods, offset_rad
-        Of the pattern: its phase is 2 pi periods share + offset.
+    periods
+        Of the pattern: its phase is 2 pi periods share.
     harmonic
         The number of steps N: a response that isn't linear gives N-step phase errors of N, 2N ... times the phase.
 
@@ -333,7 +332,7 @@ def phase_ripple_rad(
     if np.count_nonzero(known) < _LEAST_PIXELS:
         return float("nan")
     phase = wrapped_rad[known].astype(np.float64)
-    error = phase - 2 * np.pi * periods * share[known] - offset_rad
+    error = phase - 2 * np.pi * periods * share[known]
     error = (error + np.pi) % (2 * np.pi) - np.pi
     middle = np.median(error)
     usual = 1.4826 * np.median(np.abs(error - middle))

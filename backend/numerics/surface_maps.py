@@ -59,6 +59,11 @@ def curvature(
     return Curvature(mean, twist)
 
 
+def smoothed(values: Float[np.ndarray, "h w"], *, sigma_px: float) -> Float64[np.ndarray, "h w"]:
+    """Smooth a map by planes fitted to each pixel's surroundings, without bending it at the mask's edges."""
+    return _Planes(np.isfinite(values), sigma_px).smooth(values)
+
+
 class _Planes:
     """Weighted planes through the neighbourhood of every pixel of a mask."""
 
@@ -93,6 +98,15 @@ class _Planes:
         by_u[thin] = np.nan
         by_v[thin] = np.nan
         return by_u, by_v
+
+    def smooth(self, values: Float[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
+        """Return the planes' values in their middle."""
+        by_u, by_v = self.gradient(values)
+        mean = self._sum(np.where(self._valid, values, 0.0), 0, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = (mean - by_u * self._u - by_v * self._v) / self._n
+        found[~self._valid] = np.nan
+        return np.asarray(found)
 
     def _sum(
         self, values: Float64[np.ndarray, "h w"], power_u: int, power_v: int
