@@ -13,20 +13,28 @@ from backend.domain.errors import InvalidCaptureError, StageFailedError
 from backend.domain.frames import Frame
 from backend.domain.hints import Frames, Mask, Table, Value
 from backend.domain.params import Params, setting
-from backend.domain.patterns import Sine
+from backend.domain.patterns import BLACK, WHITE, Sine
 from backend.domain.rig import RigFacts
 from backend.domain.shots import Exposed, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Review
 from backend.numerics.camera_response import stratified_samples, unclipped
 from backend.numerics.errors import NumericsError
-from backend.stages.pre_exposure import ExposureGrid, PreExposureParams, search_plan
+from backend.stages.pre_exposure import ExposureGrid
 
 LONGEST_OVER_BASE = 4.0
 """The ladder's longest exposure over that of the fringes: shows the scene's dark parts at mid gray."""
 
 LIT_SHARE = 0.1
 """The mirror is where white is brighter than black by this share of what its brightest parts are."""
+
+FIRST_MS = 30.0
+MOST_TRIALS = 16
+SATURATED_SHARE = 1e-3
+"""Of the bright pixels: dead and hot ones must not decide."""
+
+NEAR_ENOUGH = 0.04
+"""The search ends when exposures that do and don't saturate differ by this."""
 
 
 class StackParams(Params):
@@ -115,18 +123,27 @@ def ladder(base_ms: float, grid: ExposureGrid, params: StackParams) -> tuple[flo
     # Whole frames leave few short exposures: longer ones tell as much, of the scene's darker parts.
     while len(chosen) < params.count and max(chosen) < grid.highest:
         chosen.add(min(grid.highest, max(max(chosen) + 1, round(1.5 * max(chosen)))))
-    return tuple(grid.ms(i) for i in sorted(chosen))
+    return tuple(_ms(grid, i) for i in sorted(chosen))
+
+
+def _ms(grid: ExposureGrid, step: int) -> float:
+    """Return the exposure of a step without the digits that counting leaves; to the nanosecond."""
+    return round(grid.ms(step), 6)
 
 
 def _region_plan(
     facts: RigFacts, params: StackParams, grid: ExposureGrid
 ) -> Plan[tuple[float, Bool[np.ndarray, "h w"]]]:
     """Find the fringes' exposure, and where the screen is seen."""
-    search = yield from search_plan(
-        facts, PreExposureParams(exposure_ms=params.base_exposure_ms, boost=1.0), grid
-    )
-    white = search.whites[search.chosen][facts.reference]
-    dark = search.dark[facts.reference]
+    camera = facts.reference
+    if params.base_exposure_ms is None:
+        white = yield from _longest_unsaturated(grid, camera)
+    else:
+        shot = Shot(WHITE, params.base_exposure_ms, cameras=(camera,), role="white")
+        white = (yield (shot,))[0][camera]
+    assert white.exposure_ms is not None, "frames of a rig always carry their exposure"
+    shot = Shot(BLACK, white.exposure_ms, cameras=(camera,), role="dark")
+    dark = (yield (shot,))[0][camera]
     light = white.gray.astype(np.float32) - dark.gray.astype(np.float32)
     brightest = float(np.quantile(light, 0.995))
     if brightest < 0.02 * white.full_scale_gray:
@@ -134,8 +151,46 @@ def _region_plan(
             f"The screen isn't seen at {white.exposure_ms:.0f} ms, white is {brightest:.1f} gray above black: "
             "turn the mirror until the camera sees the screen in it, or expose longer."
         )
-    assert white.exposure_ms is not None, "frames of a rig always carry their exposure"
     return white.exposure_ms, light > LIT_SHARE * brightest
+
+
+def _longest_unsaturated(grid: ExposureGrid, camera: str) -> Plan[Frame]:
+    """Bracket and bisect, in ratios: a tone curve says little of how far away saturation is."""
+    good: Frame | None = None
+    below, above, step = grid.lowest - 1, grid.highest + 1, grid.index(FIRST_MS)
+    for _ in range(MOST_TRIALS):
+        shot = Shot(WHITE, _ms(grid, step), cameras=(camera,), role="white")
+        white = (yield (shot,))[0][camera]
+        if _saturated_share(white) <= SATURATED_SHARE:
+            good, below = white, step
+        else:
+            above = step
+        if above - below <= max(1, NEAR_ENOUGH * below):
+            break
+        step = _between(below, above, grid)
+    if good is None:
+        raise StageFailedError(
+            f"White saturates the camera even at {grid.ms(step):g} ms: close the aperture or dim the screen."
+        )
+    return good
+
+
+def _between(below: int, above: int, grid: ExposureGrid) -> int:
+    """Return the next exposure to try, strictly between the two."""
+    if below < grid.lowest:
+        wanted = above // 3
+    elif above > grid.highest:
+        wanted = 2 * below
+    else:
+        wanted = round((below * above) ** 0.5)
+    return min(max(wanted, below + 1), above - 1)
+
+
+def _saturated_share(white: Frame) -> float:
+    """Return the share of the bright pixels that are within one gray level of full scale."""
+    gray, full = white.gray, white.full_scale_gray
+    bright = int(np.count_nonzero(gray > full / 16))
+    return float(np.count_nonzero(gray >= full - 1)) / max(bright, 1)
 
 
 def _stack_plan(
