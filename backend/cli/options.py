@@ -48,8 +48,26 @@ RigOptions = Annotated[
 Scene = Annotated[
     str | None,
     typer.Option(
-        help="Scene of the simulated rig: high-contrast, metal, workpieces, plane, sphere, step, "
-        "sprayed:NAME, mesh:FILE.  [default: high-contrast]",
+        help="Scene of a simulated rig: high-contrast, metal, workpieces, plane, sphere, step, "
+        "sprayed:NAME, mesh:FILE; mirror-flat, -parabola, -freeform, -dent, mirror:FILE.  "
+        "[default: high-contrast]",
+        show_default=False,
+    ),
+]
+ScanRig = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        help="simulated, sim-lcd, the name of an installed rig, or package.module:factory.  "
+        "[default: the simulated rig that has the scene, or that the method is made for]",
+        show_default=False,
+    ),
+]
+Chain = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LETTER",
+        help="Response of the simulated screen and camera, A (linear) to G.  [default: D]",
         show_default=False,
     ),
 ]
@@ -181,6 +199,7 @@ def parse_rig_options(
     size: str | None = None,
     projector_size: str | None = None,
     seed: int | None = None,
+    chain: str | None = None,
 ) -> dict[str, Any]:
     """Read `KEY=VALUE` and put the options of the simulated rig with them, as far as they are given.
 
@@ -189,7 +208,13 @@ def parse_rig_options(
     InvalidSettingError
         Naming the text that isn't of that form.
     """
-    named = {"scene": scene, "size": size, "projector_size": projector_size, "seed": seed}
+    named = {
+        "scene": scene,
+        "size": size,
+        "projector_size": projector_size,
+        "seed": seed,
+        "chain": chain,
+    }
     options = {name: value for name, value in named.items() if value is not None}
     for text in texts or ():
         key, equals, value = text.partition("=")

@@ -8,12 +8,13 @@ import typer
 from backend.cli.house import open_services, who
 from backend.cli.options import (
     AsJson,
+    Chain,
     DataFolder,
     Given,
     ProjectorSize,
     Quiet,
-    RigName,
     RigOptions,
+    ScanRig,
     Scene,
     Seed,
     Settings,
@@ -43,8 +44,9 @@ def register(application: typer.Typer) -> None:
 
 
 def scan(
-    rig: RigName = "simulated",
+    rig: ScanRig = None,
     scene: Scene = None,
+    chain: Chain = None,
     method: Annotated[
         str, typer.Option(help="Measuring method, see unglare methods.")
     ] = "hdr-fringe",
@@ -67,15 +69,22 @@ def scan(
 ) -> None:
     """Make a scan unattended: review gates pass on ok or warning, and stop on failure."""
     from backend.contract.requests import CreateScan
+    from backend.devices.loading import rig_for
 
     quiet_logging()
     with answering(as_json) as answer, ProgressLines(hidden=quiet) as progress:
+        options = parse_rig_options(
+            rig_options,
+            scene=scene,
+            size=size,
+            projector_size=projector_size,
+            seed=seed,
+            chain=chain,
+        )
         request = CreateScan(
             method=method,
-            rig=rig,
-            rig_options=parse_rig_options(
-                rig_options, scene=scene, size=size, projector_size=projector_size, seed=seed
-            ),
+            rig=rig or rig_for(options.get("scene"), method),
+            rig_options=options,
             name=name,
             preset=preset,
             settings=parse_settings(settings),

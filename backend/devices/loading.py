@@ -6,6 +6,7 @@ so one that is broken doesn't stop the others.
 """
 
 import importlib
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -82,7 +83,9 @@ def open_rig(name: str, options: Mapping[str, object] | None = None) -> Rig:
 def options_schema(name: str) -> dict[str, Any]:
     """Return the JSON schema of a rig's options, empty where its factory doesn't say.
 
-    A factory says it by an attribute `options_model`: the pydantic model of the mapping that it takes.
+    A factory says it by an attribute `options_model`: the pydantic model of the mapping that it takes. Beside the
+    properties the schema may hold `methods`, the methods that the rig is made for; its property `scene`
+    may have a `pattern` that tells whose scene a name is.
 
     Raises
     ------
@@ -91,6 +94,23 @@ def options_schema(name: str) -> dict[str, Any]:
     """
     model = getattr(_factory(name), "options_model", None)
     return model.model_json_schema() if model else {}
+
+
+def rig_for(scene: str | None, method: str) -> str:
+    """Return the built-in rig that a scene belongs to, or without a scene the one that a method is made for.
+
+    Examples
+    --------
+    >>> rig_for("plane", "hdr-fringe"), rig_for("mirror-flat", "fringe-reflection")
+    ('simulated', 'sim-lcd')
+    """
+    schemas = {name: options_schema(name) for name in _BUILT_IN}
+    for name, schema in schemas.items():
+        pattern = schema["properties"]["scene"].get("pattern")
+        made_for = method in schema.get("methods", ())
+        if (pattern and re.search(pattern, scene)) if scene else made_for:
+            return name
+    return next(iter(_BUILT_IN))
 
 
 def _factory(name: str) -> Callable[[Mapping[str, object]], Any]:

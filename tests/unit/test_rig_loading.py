@@ -56,7 +56,7 @@ def test_the_simulated_rig_is_built_in():
 
 
 def test_a_plug_in_opens_and_a_broken_one_does_not_stop_it(plug_ins):
-    assert [rig.name for rig in available_rigs()] == ["simulated", "toy", "broken"]
+    assert [rig.name for rig in available_rigs()] == ["simulated", "sim-lcd", "toy", "broken"]
     assert getattr(open_rig("toy", {"a": 1}), "options", None) == {"a": 1}
     with pytest.raises(RigNotFoundError, match=r"rig broken can't be loaded.*no_such_thing"):
         open_rig("broken")
@@ -111,3 +111,18 @@ def test_options_may_be_text():
     assert isinstance(rig, SimulatedRig)
     config = rig.config
     assert (config.size, config.seed, config.realtime, config.gamma) == ((64, 48), 7, False, 2.2)
+
+
+@pytest.mark.parametrize(
+    ("scene", "method", "rig"),
+    [
+        (None, "hdr-fringe", "simulated"),
+        (None, "fringe-reflection", "sim-lcd"),
+        ("metal", "hdr-fringe", "simulated"),
+        ("mirror-dent", "fringe-reflection", "sim-lcd"),
+        ("mirror:facet.npy", "hdr-fringe", "sim-lcd"),
+        ("mesh:mirror-flat.ply", "fringe-reflection", "simulated"),
+    ],
+)
+def test_scenes_and_methods_find_their_rig(scene, method, rig):
+    assert loading.rig_for(scene, method) == rig

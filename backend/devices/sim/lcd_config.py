@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import AliasChoices, ConfigDict, Field, field_validator
 
 from backend.devices.sim.chains import CHAINS
 from backend.devices.sim.options import RigOptions, Size
@@ -12,6 +12,11 @@ Defect = Literal["dropped", "duplicated", "dimmed"]
 
 class SimulatedLcdConfig(RigOptions):
     """A mirror, the screen that the camera sees in it, and what goes wrong with them."""
+
+    model_config = ConfigDict(
+        title="Simulated screen and mirror",
+        json_schema_extra={"methods": ["fringe-reflection"]},
+    )
 
     scene: str = Field(
         "mirror-parabola",
@@ -29,8 +34,10 @@ class SimulatedLcdConfig(RigOptions):
     """Letter of the response from control value to gray level; A is linear."""
     size: Size = (1280, 960)
     """Width and height of the camera in [px]; `1280x960` is understood too."""
-    screen_size: Size = (1920, 1080)
-    """Width and height of the screen in [px]."""
+    screen_size: Size = Field(
+        (1920, 1080), validation_alias=AliasChoices("screen_size", "projector_size")
+    )
+    """Width and height of the screen in [px]; the rig's projector."""
     bit_depth: int = 8
     """Bits per pixel that the camera starts with, 8 or 12."""
     seed: int = Field(0, ge=0, lt=2**32)
