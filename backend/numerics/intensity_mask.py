@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from backend.numerics.response_fit import FULL_LIGHT
 
@@ -135,71 +135,3 @@ def smooth(factor: Float32[np.ndarray, "h w"], sigma_px: float) -> Float32[np.nd
         logarithm, 2 * int(np.ceil(2 * sigma_px)) + 1, _LOG_EDGE, sigma_px
     )
     return np.asarray(np.exp(smoothed), np.float32)
-
-
-def agreeing(
-    projector_px: Float32[np.ndarray, "h w"],
-    projector_row_px: Float32[np.ndarray, "h w"],
-    *,
-    tolerance_px: float,
-) -> Bool[np.ndarray, "h w"]:
-    """Tell which pixels look where most of their 3 x 3 neighbourhood does; a lone wrong code would dim a stranger.
-
-    At least three of the eight neighbours, within the tolerance in both directions.
-    """
-    count = np.zeros(projector_px.shape, np.uint8)
-    u, v = (np.pad(m, 1, constant_values=np.nan) for m in (projector_px, projector_row_px))
-    height, width = projector_px.shape
-    for dy in range(3):
-        for dx in range(3):
-            if (dy, dx) == (1, 1):
-                continue
-            near = (slice(dy, dy + height), slice(dx, dx + width))
-            with np.errstate(invalid="ignore"):
-                count += (np.abs(u[near] - projector_px) <= tolerance_px) & (
-                    np.abs(v[near] - projector_row_px) <= tolerance_px
-                )
-    return np.asarray(count >= 3)
-
-
-def fill_runs(
-    position_px: Float32[np.ndarray, "h w"],
-    fillable: Bool[np.ndarray, "h w"],
-    *,
-    longest_px: int,
-    steepest: float = 4.0,
-) -> Float32[np.ndarray, "h w"]:
-    """Fill runs of unknown positions along rows with the straight line between the known ends.
-
-    Parameters
-    ----------
-    position_px
-        Projector position per camera pixel; NaN unknown.
-    fillable
-        Unknown pixels that may be filled, e.g. the saturated ones.
-    longest_px
-        Runs longer than this stay unknown.
-    steepest
-        So do runs whose ends differ by more than this many projector pixels per camera pixel: another surface.
-
-    Examples
-    --------
-    >>> row = np.float32([[2, np.nan, np.nan, 5]])
-    >>> fill_runs(row, np.isnan(row), longest_px=3)
-    array([[2., 3., 4., 5.]], dtype=float32)
-    """
-    width = position_px.shape[1]
-    known = ~np.isnan(position_px)
-    x = np.broadcast_to(np.arange(width), position_px.shape)
-    left = np.maximum.accumulate(np.where(known, x, -1), axis=1)
-    right = np.minimum.accumulate(np.where(known, x, width)[:, ::-1], axis=1)[:, ::-1]
-    use = fillable & ~known & (left >= 0) & (right < width) & (right - left - 1 <= longest_px)
-    rows, columns = np.nonzero(use)
-    start, end = left[rows, columns], right[rows, columns]
-    first, last = position_px[rows, start], position_px[rows, end]
-    slope = (last - first) / (end - start).astype(np.float32)
-    steady = np.abs(slope) <= steepest
-    filled = position_px.copy()
-    value = first + slope * (columns - start).astype(np.float32)
-    filled[rows[steady], columns[steady]] = value[steady]
-    return filled

@@ -1,8 +1,11 @@
 """A rig's calibration in the words of numerics."""
 
+from collections.abc import Mapping, Sequence
+
 from backend.domain.errors import InvalidCalibrationError
 from backend.domain.rig import PinholeModel, Pose, RigCalibration
 from backend.numerics.camera_model import Pinhole, RigidTransform, compose, inverse
+from backend.numerics.code_certainty import PairGeometry
 
 
 def pinhole(model: PinholeModel) -> Pinhole:
@@ -21,6 +24,22 @@ def projector_from_reference(calibration: RigCalibration) -> RigidTransform | No
     if calibration.projector is None or calibration.projector_from_world is None:
         return None
     return from_reference(calibration, calibration.projector_from_world)
+
+
+def camera_geometry(
+    calibration: RigCalibration | None, cameras: Sequence[str]
+) -> Mapping[str, PairGeometry]:
+    """Return each camera against the projector; empty where the rig or its projector isn't calibrated."""
+    projector_from_rig = None if calibration is None else projector_from_reference(calibration)
+    if calibration is None or calibration.projector is None or projector_from_rig is None:
+        return {}
+    found = {}
+    for name in cameras:
+        camera = require_camera(calibration, name)
+        camera_from_rig = from_reference(calibration, calibration.camera_from_world[name])
+        pose = compose(projector_from_rig, inverse(camera_from_rig))
+        found[name] = PairGeometry(camera, pinhole(calibration.projector), pose)
+    return found
 
 
 def require_camera(calibration: RigCalibration, name: str) -> Pinhole:
