@@ -14,6 +14,8 @@ from backend.cli.options import (
     Quiet,
     RigName,
     RigOptions,
+    Scene,
+    Seed,
     Size,
     parse_rig_options,
 )
@@ -58,6 +60,34 @@ def table_i(
     options = parse_rig_options(rig_options, size=size, projector_size=projector_size)
     _report(
         lambda context, progress: make(context, rig, options),
+        out=out,
+        data=data,
+        as_json=as_json,
+        quiet=quiet,
+    )
+
+
+@_reports.command(name="table-iv")
+def table_iv(
+    scene: Scene = "workpieces",
+    out: Out = None,
+    size: Size = None,
+    projector_size: ProjectorSize = None,
+    seed: Seed = None,
+    rig: RigName = "simulated",
+    rig_options: RigOptions = None,
+    data: DataFolder = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare a scene without mask at two exposures, under the mask, and sprayed: completeness and error per part."""
+    from backend.services.table_iv import table_iv as make
+
+    options = parse_rig_options(
+        rig_options, scene=scene, size=size, projector_size=projector_size, seed=seed
+    )
+    _report(
+        lambda context, progress: make(context, options, rig=rig, progress=progress),
         out=out,
         data=data,
         as_json=as_json,

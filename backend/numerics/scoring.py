@@ -182,6 +182,23 @@ def score(
     )
 
 
+def point_errors(
+    points_mm: Float[np.ndarray, "n 3"],
+    pixel_x: Real[np.ndarray, "n"],
+    pixel_y: Real[np.ndarray, "n"],
+    truth: Truth,
+) -> tuple[Int64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """Return each point's nearest pixel (counted row by row) and its signed error in [mm], as `score` has them.
+
+    Raises
+    ------
+    NumericsError
+        If a point lies outside the picture.
+    """
+    place = _Place.of(pixel_x, pixel_y, truth.part.shape)
+    return place.home, _errors(points_mm, place, truth)
+
+
 class _Place(NamedTuple):
     """Where points lie in the picture."""
 

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from backend.devices.protocols import KnowsTruth, Rig
 from backend.domain.errors import UnglareError
 from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
 from backend.jobs.plan import PlannedStage
 from backend.numerics.reasons import Reason
-from backend.numerics.scoring import DEFINITION, Score, Scores, Truth, score
+from backend.numerics.scoring import DEFINITION, Score, Scores, Truth, point_errors, score
 from backend.services.context import Context
 from backend.stages.cloud import Cloud
 from backend.storage.codec import decode
@@ -139,6 +140,14 @@ def compare_with_truth(cloud: Cloud, truth: Truth) -> Scores | None:
         return None
     given_up = None if reasons is None else (reasons & np.uint16(Reason.SATURATED)) != 0
     return score(cloud.points_mm, cloud.pixel_x, cloud.pixel_y, truth, over_exposed=given_up)
+
+
+def error_map(cloud: Cloud, truth: Truth) -> Float32[np.ndarray, "h w"]:
+    """Return the signed distance of the points behind the true surface, at their nearest pixels; NaN without one."""
+    found = np.full(truth.part.size, np.nan, np.float32)
+    home, error_mm = point_errors(cloud.points_mm, cloud.pixel_x, cloud.pixel_y, truth)
+    found[home] = error_mm
+    return found.reshape(truth.part.shape)
 
 
 def reference_camera(cloud: Cloud) -> str:
