@@ -37,7 +37,7 @@ class GrayCode(NamedTuple):
     projector_px: Float32[np.ndarray, "h w"]
     """Projector coordinate of the stripe's middle, pixel centres at integers; NaN where invalid."""
     contrast_gray: UInt16[np.ndarray, "h w"]
-    """Contrast of the weakest bit that was judged, |pattern - inverse| in [gray]."""
+    """Contrast of the weakest bit that was judged, |pattern - inverse| in [gray]; 65535 if none was."""
     reasons: UInt16[np.ndarray, "h w"]
     """Why a pixel is invalid: bits of `Reason`, 0 where it is valid."""
 
@@ -51,6 +51,7 @@ def decode_gray_code(
     min_contrast_gray: float = 5.0,
     ignored_low_bits: int = 0,
     unjudged_low_bits: int = 0,
+    spared_bits: int = 0,
     saturation_gray: float = float("inf"),
     out: GrayCode | None = None,
 ) -> GrayCode:
@@ -72,6 +73,9 @@ def decode_gray_code(
     unjudged_low_bits
         Finest of the bits read whose contrast isn't judged: where the optics don't resolve them the
         code is 2**n stripes uncertain instead of invalid.
+    spared_bits
+        1: the weakest bit of each pixel isn't judged. On the border of two codes exactly one bit changes, so
+        there it must be uncertain, and the code is one of the two all the same. 0: all bits are judged.
     saturation_gray
         A pixel is saturated where pattern and inverse of one bit both reach this gray level.
     out
@@ -99,9 +103,21 @@ def decode_gray_code(
             f"{bits} patterns but {len(inverses)} inverses were given: give both of every bit"
         )
     reading = _reading(bits, codes, ignored_low_bits, unjudged_low_bits)
+    if spared_bits not in (0, 1):
+        raise CodeError(
+            f"{spared_bits} bits can't be spared: at the border of codes it is one, give 0 or 1"
+        )
     frames = [*patterns[: reading.read], *inverses[: reading.read]]
     return _decode(
-        frames, reading, _INVERSE, codes, size_px, min_contrast_gray, saturation_gray, out=out
+        frames,
+        reading,
+        _INVERSE,
+        codes,
+        size_px,
+        min_contrast_gray,
+        saturation_gray,
+        spared_bits=spared_bits,
+        out=out,
     )
 
 
@@ -213,6 +229,7 @@ def _decode(
     min_contrast_gray: float,
     saturation_gray: float,
     double_threshold_gray: int = 0,
+    spared_bits: int = 0,
     out: GrayCode | None = None,
 ) -> GrayCode:
     stack = frame_stack(frames)
@@ -242,6 +259,7 @@ def _decode(
             shift=reading.left_out,
             codes=codes,
             pixels_per_code=size_px / codes,
+            spared=spared_bits,
         ),
         _Maps(*(plane.reshape(-1) for plane in result)),
     )
@@ -256,6 +274,7 @@ class _Decision(NamedTuple):
     shift: int
     codes: int
     pixels_per_code: float
+    spared: int
 
 
 class _Maps(NamedTuple):
@@ -282,6 +301,17 @@ def _read_bit(pattern: Any, inverse: Any, binary: Any, code: Any, contrast: Any)
         strength = np.uint16(p - q) if p > q else np.uint16(q - p)
         old = contrast[i]
         contrast[i] = strength if strength < old else old
+
+
+@row_loop
+def _keep_second(pattern: Any, inverse: Any, contrast: Any, second: Any) -> None:
+    """Keep the contrast of the weakest bit but one; called before `contrast` takes the new bit in."""
+    for i in range(second.size):
+        p, q = np.uint16(pattern[i]), np.uint16(inverse[i])
+        strength = np.uint16(p - q) if p > q else np.uint16(q - p)
+        weakest, old = contrast[i], second[i]
+        larger = strength if strength > weakest else weakest
+        second[i] = larger if larger < old else old
 
 
 @row_loop
@@ -348,6 +378,7 @@ class _Rows(NamedTuple):
     code: Any  # uint16
     contrast: Any  # uint16: of the weakest bit
     unjudged: Any  # uint16: takes the contrast of bits that aren't judged
+    second: Any  # uint16: of the weakest bit but one
     brightest: Any  # uint16: darker one of pattern and inverse, at its brightest
     reference: Any  # int32: twice the gray level between black and white
 
@@ -363,11 +394,15 @@ def _read_inverse(
         first, second = addresses[bit], addresses[bits + bit]
         if wide:
             p, q = wide_part(first, start, n), wide_part(second, start, n)
+            if decision.spared and bit < decision.judged:
+                _keep_second(p, q, weakest, rows.second[:n])
             _read_bit(p, q, binary, code, weakest)
             if decision.saturation <= _LARGEST:
                 _keep_both_bright(p, q, brightest)
         else:
             a, b = narrow_part(first, start, n), narrow_part(second, start, n)
+            if decision.spared and bit < decision.judged:
+                _keep_second(a, b, weakest, rows.second[:n])
             _read_bit(a, b, binary, code, weakest)
             if decision.saturation <= _LARGEST:
                 _keep_both_bright(a, b, brightest)
@@ -414,6 +449,7 @@ def _decode_share(
         np.empty(_TILE, np.uint16),
         np.empty(_TILE, np.uint16),
         np.empty(_TILE, np.uint16),
+        np.empty(_TILE, np.uint16),
         np.empty(_TILE, np.int32),
     )
     start = _TILE * take_next(counter)
@@ -423,6 +459,7 @@ def _decode_share(
         _fill(rows.binary, 0)
         _fill(rows.code, 0)
         _fill(rows.contrast, 0xFFFF)
+        _fill(rows.second, 0xFFFF)
         _fill(rows.brightest, 0)
         if mode == _INVERSE:
             _read_inverse(addresses, wide, start, n, bits, decision, rows)
@@ -430,7 +467,7 @@ def _decode_share(
             _read_against(addresses, wide, start, n, bits, decision, rows)
         _store(
             rows.code[:n],
-            rows.contrast[:n],
+            rows.second[:n] if decision.spared else rows.contrast[:n],
             rows.brightest[:n],
             decision,
             maps.code[start:end],

@@ -28,6 +28,7 @@ class Reason(IntFlag):
     CLIPPED = 1 << 11
     MISSING_DATA = 1 << 12
     CODE_MARGIN = 1 << 13
+    HIDDEN_EDGE = 1 << 14
 
 
 SENTENCES: Mapping[Reason, str] = MappingProxyType(
@@ -46,6 +47,7 @@ SENTENCES: Mapping[Reason, str] = MappingProxyType(
         Reason.CLIPPED: "Clipped: outside the measuring volume that was set.",
         Reason.MISSING_DATA: "No data: masked, or a frame that is needed wasn't captured.",
         Reason.CODE_MARGIN: "Uncertain code: pattern and reference are too alike to tell black from white.",
+        Reason.HIDDEN_EDGE: "Hidden edge: pattern and inverse are both saturated where they cross, so the edge's place could only be guessed.",
     }
 )
 """What the operator reads about each reason."""

@@ -7,6 +7,8 @@ MODULES = (
     "backend.numerics.phasors",
     "backend.numerics.gray_code",
     "backend.numerics.edges",
+    "backend.numerics.line_shift",
+    "backend.numerics.edge_positions",
     "backend.numerics.warm_up_geometry",
     "backend.numerics.gathering",
 )

@@ -22,7 +22,7 @@ def silent(done, text=""):
 
 
 def decode(frames, **settings):
-    return edges(import_code_frames(frames), procam.facts(), EdgesParams(**settings), silent)
+    return edges(import_code_frames(frames), None, procam.facts(), EdgesParams(**settings), silent)
 
 
 def cloud_of(codes, calibration=None, **settings):
@@ -90,7 +90,7 @@ def test_more_bits_than_there_are_cannot_be_ignored():
 def test_the_size_of_the_pattern_has_to_be_known():
     facts = replace(procam.facts(), projector=None)
     with pytest.raises(StageFailedError, match="add the projector"):
-        edges(import_code_frames(procam.gray_frames()), facts, EdgesParams(), silent)
+        edges(import_code_frames(procam.gray_frames()), None, facts, EdgesParams(), silent)
 
 
 def depth_error_mm(cloud):

@@ -91,6 +91,22 @@ def test_bits_without_contrast_may_be_read_unjudged():
     assert np.abs(unjudged.code[0] - COLUMNS[0]).max() == 1
 
 
+def test_one_weak_bit_may_be_spared_and_two_may_not():
+    patterns = frames_of(16, 4, columns=COLUMNS)
+    inverses = frames_of(16, 4, columns=COLUMNS, inverse=True)
+    patterns[2][0] = inverses[2][0] = 70
+    arguments: dict[str, Any] = {"codes": 16, "size_px": WIDTH_PX}
+    spared = decode_gray_code(patterns, inverses, spared_bits=1, **arguments)
+    assert (spared.reasons == 0).all()
+    assert (spared.contrast_gray == 100).all()
+    patterns[0][0] = inverses[0][0] = 70
+    judged = decode_gray_code(patterns, inverses, spared_bits=1, **arguments)
+    assert (judged.reasons[0] == int(Reason.CODE_MARGIN)).all()
+    assert (judged.reasons[1] == 0).all()
+    with pytest.raises(CodeError, match="give 0 or 1"):
+        decode_gray_code(patterns, inverses, spared_bits=2, **arguments)
+
+
 def test_maps_are_reused_when_given_and_have_to_fit():
     patterns = frames_of(16, 4, columns=COLUMNS)
     inverses = frames_of(16, 4, columns=COLUMNS, inverse=True)

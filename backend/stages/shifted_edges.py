@@ -1,0 +1,114 @@
+"""The place within a stripe of the Gray code, from shifted stripes: maps of one camera along one direction."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, UInt16
+
+from backend.domain.errors import StageFailedError
+from backend.domain.rig import CameraFacts, ProjectorFacts
+from backend.numerics.edge_positions import EdgePositions, edge_positions
+from backend.numerics.line_shift import LineShift, LineShiftLimits, Stripes, decode_line_shift
+from backend.numerics.reasons import Reason
+from backend.numerics.uncertainty import NoiseModel
+from backend.stages.code_frames import CodeSet, StripeSet
+from backend.stages.intensity_mask import IntensityMask
+
+_SPARE_PX = 1.5
+"""Blur and noise may move a coarse position so far beyond the stripe that it names."""
+
+
+@dataclass(frozen=True)
+class ShiftedEdges:
+    """Sub-pixel coordinate of every pixel, and the edges along the camera's rows (or columns)."""
+
+    located: LineShift
+    edges: EdgePositions
+
+
+def shifted_edges(
+    code: CodeSet,
+    coarse_px: Float32[np.ndarray, "h w"],
+    *,
+    coarse_width_px: float,
+    projector: ProjectorFacts,
+    camera: CameraFacts,
+    limits: LineShiftLimits,
+    mask: IntensityMask | None,
+    across_px: Float32[np.ndarray, "h w"] | None,
+) -> ShiftedEdges:
+    """Locate the stripes of a set, whose Gray code names each pixel's stripe.
+
+    `coarse_px` is the middle of the Gray code's stripe, NaN where it can't be read, `coarse_width_px` that stripe's
+    width, `across_px` the coordinate along the stripes, by which the mask is looked up.
+    """
+    assert code.stripes is not None, "only sets with stripes come here"
+    size_px = projector.width_px if code.axis == "x" else projector.height_px
+    stripes = code.stripes.stripes(size_px)
+    limits = limits._replace(coarse_error_px=_coarse_error_px(coarse_width_px, stripes))
+    patterns = [f.gray for f in code.stripes.patterns]
+    inverses = [f.gray for f in code.stripes.inverses]
+    located = decode_line_shift(
+        patterns,
+        inverses,
+        stripes,
+        coarse_px,
+        size_px=size_px,
+        noise=_noise(camera, code.stripes),
+        limits=limits,
+        mask=None if mask is None else _factor(mask, code.axis, projector),
+        across_px=across_px,
+    )
+    return ShiftedEdges(located, _edges(code, located, stripes, size_px))
+
+
+def with_coarse_reasons(
+    located: LineShift, coarse: UInt16[np.ndarray, "h w"]
+) -> UInt16[np.ndarray, "h w"]:
+    """Say of pixels without a coarse position why they have none."""
+    lacks_code = (located.reasons == np.uint16(Reason.MISSING_DATA)) & (coarse != 0)
+    return np.where(lacks_code, coarse, located.reasons)
+
+
+def _coarse_error_px(coarse_width_px: float, stripes: Stripes) -> float:
+    """Refuse a Gray code too coarse to tell one period from the next."""
+    error_px = coarse_width_px / 2 + _SPARE_PX
+    if error_px > stripes.period_px / 2:
+        raise StageFailedError(
+            f"The Gray code tells stripes of {coarse_width_px:g} px, too coarse for shifted stripes with a period of "
+            f"{stripes.period_px:g} px: capture finer bits or wider stripes."
+        )
+    return error_px
+
+
+def _noise(camera: CameraFacts, stripes: StripeSet) -> NoiseModel:
+    return NoiseModel.of_camera(
+        read_noise_e=camera.read_noise_e,
+        full_well_e=camera.full_well_e,
+        full_scale_gray=camera.full_scale_gray,
+        black_gray=camera.black_level_gray,
+        gain_db=stripes.patterns[0].gain_db,
+    )
+
+
+def _factor(
+    mask: IntensityMask, axis: str, projector: ProjectorFacts
+) -> Float32[np.ndarray, "across along"]:
+    factor = np.asarray(mask.factor, np.float32)
+    if factor.shape != (projector.height_px, projector.width_px):
+        raise StageFailedError(
+            f"The intensity mask is {factor.shape[1]} x {factor.shape[0]} px, the projector {projector.width_px} x "
+            f"{projector.height_px}: make it anew for this projector."
+        )
+    return factor if axis == "x" else np.ascontiguousarray(factor.T)
+
+
+def _edges(code: CodeSet, located: LineShift, stripes: Stripes, size_px: int) -> EdgePositions:
+    """Place the edges along rows for columns, along columns for rows."""
+    assert code.stripes is not None, "only sets with stripes come here"
+    pictures = [[f.gray for f in group] for group in (code.stripes.patterns, code.stripes.inverses)]
+    place = located.projector_px
+    if code.axis == "y":
+        pictures = [[np.ascontiguousarray(p.T) for p in group] for group in pictures]
+        place = np.ascontiguousarray(place.T)
+    return edge_positions(*pictures, stripes, place, size_px=size_px)
