@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from backend.numerics.errors import NumericsError
-from backend.numerics.pinhole import RigidTransform
+from backend.numerics.pinhole import RigidTransform, compose, inverse
 
 DEFINITION = (
     "Base: pixels of the camera that lie wholly on the mirror and see the screen in it. "
@@ -34,6 +34,17 @@ class MirrorTruth:
         """Unit normals in the mirror's frame, towards the viewer."""
         up = np.stack([-self.slopes[0], -self.slopes[1], np.ones(self.seen.shape)], axis=-1)
         return np.asarray(up / np.linalg.norm(up, axis=-1, keepdims=True))
+
+    def in_frame(self, mirror_from_camera: RigidTransform) -> "MirrorTruth":
+        """Return the same truth in another frame of the mirror, given by its pose."""
+        turn = compose(mirror_from_camera, inverse(self.mirror_from_camera))
+        normals = self.normals @ turn.R.T
+        return MirrorTruth(
+            points_mm=np.asarray(self.points_mm @ turn.R.T + turn.t_mm),
+            slopes=np.asarray(np.moveaxis(-normals[..., :2] / normals[..., 2:], -1, 0)),
+            seen=self.seen,
+            mirror_from_camera=mirror_from_camera,
+        )
 
 
 class MirrorScore(NamedTuple):

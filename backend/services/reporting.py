@@ -2,9 +2,9 @@
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float32
@@ -12,16 +12,27 @@ from jaxtyping import Float32
 from backend.devices.protocols import KnowsTruth, Rig
 from backend.domain.errors import UnglareError
 from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
-from backend.jobs.plan import PlannedStage
+from backend.numerics.mirror_scoring import MirrorScore
 from backend.numerics.reasons import Reason
 from backend.numerics.scoring import DEFINITION, Score, Scores, Truth, point_errors, score
 from backend.services.context import Context
+from backend.services.mirror_report import (
+    MeasuredMirror,
+    compare_mirror,
+    known_mirror,
+    measured_mirror,
+    mirror_document,
+)
 from backend.stages.cloud import Cloud
+from backend.stages.slopes import Slopes
+from backend.stages.surface import Surface
 from backend.storage.codec import decode
 from backend.storage.repositories import Repositories
 from backend.storage.rows import GivenRow, RunRow
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 DEFINITION_OF_FIGURES = DEFINITION
 """How completeness and error are counted, for the help of whatever shows them."""
@@ -43,6 +54,8 @@ class ScanReport:
     """Exposure time of one camera's frames, if a stage tells."""
     scores: Scores | None
     """None: nobody knows the truth."""
+    mirror: MirrorScore | None = None
+    """None: no mirror was measured, or nobody knows its truth."""
 
     @property
     def computing_s(self) -> float:
@@ -59,6 +72,7 @@ class ScanReport:
             "rig_s": round(self.waited_s, 3),
             "light_s": _number(self.light_s),
             **truth_document(self.scores),
+            **mirror_document(self.mirror),
         }
 
 
@@ -93,6 +107,10 @@ def report(context: Context, scan: str) -> ScanReport:
     with context.database.reading() as repositories:
         loaded = load_scan(repositories, context.registry, scan)
         cloud = load_cloud(context, repositories, loaded)
+        mirror = measured_mirror(
+            _last(context, repositories, loaded, Slopes),
+            _last(context, repositories, loaded, Surface),
+        )
         light_s = _light_s(repositories, loaded)
     runs = [planned.run for planned in loaded.plan.stages if planned.run]
     return ScanReport(
@@ -102,25 +120,24 @@ def report(context: Context, scan: str) -> ScanReport:
         waited_s=sum(run.device.get("rig", {}).get("waited_s", 0.0) for run in runs),
         light_s=light_s,
         scores=_scores(context, loaded, cloud) if cloud else None,
+        mirror=_mirror_score(context, loaded, mirror) if mirror else None,
     )
 
 
 def load_cloud(context: Context, repositories: Repositories, loaded: LoadedScan) -> Cloud | None:
     """Return the last cloud of a scan, mapped; None if there is none."""
-    planned = cloud_stage(loaded)
-    if planned is None or planned.result is None:
+    return _last(context, repositories, loaded, Cloud)
+
+
+def _last(
+    context: Context, repositories: Repositories, loaded: LoadedScan, kind: type[T]
+) -> T | None:
+    """Return the result of the last stage that makes a type, its arrays mapped; None if there is none."""
+    makers = [planned for planned in loaded.plan.stages if planned.stage.output is kind]
+    if not makers or makers[-1].result is None:
         return None
-    document = document_of(repositories, planned.result)
-    cloud: Cloud = decode(document, Cloud, context.store)
-    return cloud
-
-
-def cloud_stage(loaded: LoadedScan) -> PlannedStage | None:
-    """Return the last stage that makes a cloud; None if the method has none."""
-    for planned in reversed(loaded.plan.stages):
-        if planned.stage.output is Cloud:
-            return planned
-    return None
+    found: T = decode(document_of(repositories, makers[-1].result), kind, context.store)
+    return found
 
 
 def document_of(repositories: Repositories, result: RunRow | GivenRow) -> Mapping[str, Any]:
@@ -158,16 +175,21 @@ def reference_camera(cloud: Cloud) -> str:
 def rig_truth(
     context: Context, loaded: LoadedScan, reference: str, cameras: tuple[str, ...]
 ) -> Truth | None:
-    """Ask the scan's rig for the truth; None if the rig didn't know it when it captured, or can't be asked now.
+    """Ask the scan's rig for the truth; None if the rig didn't know it when it captured, or can't be asked now."""
+
+    def ask(rig: Rig) -> Truth | None:
+        return rig.truth(reference, cameras or None) if isinstance(rig, KnowsTruth) else None
+
+    return _ask_rig(context, loaded, ask)
+
+
+def _ask_rig(context: Context, loaded: LoadedScan, ask: Callable[[Rig], T | None]) -> T | None:
+    """Ask the scan's rig something of the truth.
 
     Hardware is never opened for it: an old scan can be exported where its rig is long gone.
     """
     if loaded.row.rig == NO_RIG or not _knew_truth(loaded):
         return None
-
-    def ask(rig: Rig) -> Truth | None:
-        return rig.truth(reference, cameras or None) if isinstance(rig, KnowsTruth) else None
-
     try:
         return context.rigs.use(loaded.row.rig, loaded.row.rig_options, ask)
     except UnglareError as error:
@@ -184,6 +206,13 @@ def _knew_truth(loaded: LoadedScan) -> bool:
 def _scores(context: Context, loaded: LoadedScan, cloud: Cloud) -> Scores | None:
     truth = rig_truth(context, loaded, reference_camera(cloud), cloud.cameras)
     return compare_with_truth(cloud, truth) if truth else None
+
+
+def _mirror_score(
+    context: Context, loaded: LoadedScan, mirror: MeasuredMirror
+) -> MirrorScore | None:
+    truth = _ask_rig(context, loaded, lambda rig: known_mirror(rig, mirror.camera))
+    return compare_mirror(mirror, truth) if truth else None
 
 
 def _light_s(repositories: Repositories, loaded: LoadedScan) -> float | None:

@@ -56,6 +56,16 @@ def test_maps_of_another_size_are_refused(truth):
         score_mirror(np.zeros((2, 4, 4)), np.zeros((4, 4)), truth)
 
 
+def test_in_another_frame_the_truth_is_the_same_mirror(truth):
+    c, s = np.cos(0.1), np.sin(0.1)
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    turned = truth.in_frame(RigidTransform(turn, np.array([1.0, 2.0, 3.0])))
+    np.testing.assert_allclose(turned.normals[truth.seen], truth.normals[truth.seen] @ turn.T)
+    back = turned.in_frame(truth.mirror_from_camera)
+    np.testing.assert_allclose(back.points_mm[truth.seen], truth.points_mm[truth.seen], atol=1e-12)
+    np.testing.assert_allclose(back.slopes, truth.slopes, atol=1e-12)
+
+
 def test_normals_point_to_the_viewer(truth):
     normals = truth.normals[truth.seen]
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
