@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from backend.api.errors import TooLargeError
 from backend.domain.errors import InvalidCaptureError, StorageFullError
+from backend.services.capture_sources import is_foreign
 
 CAPTURE_FILE = "capture.json"
 _MOST_FILES = 20_000
@@ -141,6 +142,8 @@ def _copy(
 
 def _capture_file(folder: Path) -> Path:
     found = sorted(folder.rglob(CAPTURE_FILE))
+    if not found and is_foreign(folder):
+        return folder
     if len(found) != 1:
         raise InvalidCaptureError(
             f"The zip file holds {len(found)} files named {CAPTURE_FILE}; it has to hold exactly one, beside its frames."

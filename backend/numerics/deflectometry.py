@@ -276,7 +276,7 @@ def solve_slopes(
         _require_points(met, "meet the mirror's surface")
         # Weights carry over from round to round, so that each round needs a few steps only.
         fit = fit_slopes(
-            points[met], slopes[met], order=order, robust=robust, weights=weights[met], rounds=8
+            points[met], slopes[met], order=order, robust=robust, weights=weights[met], rounds=5
         )
         weights[met] = fit.weights
         before, surface = surface, _through_start(fit.surface, start)

@@ -10,7 +10,9 @@ from backend.numerics.kernels import kernel, kernel_input
 
 _COARSEST = 4
 """Levels end when a side is this small."""
-_SWEEPS_AT_THE_END = 30
+_SWEEPS_AT_THE_END = 12
+_SMALL_PX = 1 << 16
+"""Grids below this are done by one thread: waking the others costs more."""
 _MOST_ROUNDS = 300
 
 
@@ -190,9 +192,13 @@ def _v_cycle(
 ) -> Float64[np.ndarray, "h w"]:
     level = levels[depth]
     found = np.zeros_like(wanted)
+    threads = numba.get_num_threads()
+    if wanted.size < _SMALL_PX:
+        numba.set_num_threads(1)
     if depth == len(levels) - 1:
         for colour in (0, 1) * _SWEEPS_AT_THE_END + (1, 0) * _SWEEPS_AT_THE_END:
             _smooth(*level, wanted, found, colour)
+        numba.set_num_threads(threads)
         return found
     _smooth(*level, wanted, found, 0)
     _smooth(*level, wanted, found, 1)
@@ -200,10 +206,12 @@ def _v_cycle(
     _apply(*level, found, rest)
     np.subtract(wanted, rest, out=rest)
     coarse = _v_cycle(levels, _gather(rest), depth + 1)
+    numba.set_num_threads(threads if wanted.size >= _SMALL_PX else 1)
     found += np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)[: rest.shape[0], : rest.shape[1]]
     # The same sweeps backwards: the preconditioner has to be symmetric.
     _smooth(*level, wanted, found, 1)
     _smooth(*level, wanted, found, 0)
+    numba.set_num_threads(threads)
     return found
 
 

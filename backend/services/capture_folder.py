@@ -1,8 +1,8 @@
 """Reading a captured folder: `capture.json`, its pictures, its calibration. Nothing is stored here."""
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from backend.contract.capture import Capture, CapturedCamera, CapturedFrame
 from backend.domain.errors import InvalidCaptureError
-from backend.domain.rig import CameraFacts, ProjectorFacts, RigFacts
+from backend.domain.rig import CameraFacts, ProjectorFacts, RigCalibration, RigFacts
 
 ASSUMED_FULL_WELL_E = 10_000.0
 ASSUMED_READ_NOISE_E = 10.0
@@ -28,6 +28,16 @@ class CaptureFolder:
     capture: Capture
     scan: dict[str, Any] | None
     """The `scan.json` beside it, if there is one."""
+    calibration: RigCalibration | None = None
+    """Where another program's file says more than a `capture.json` can; else the capture's own is read."""
+    given: Mapping[str, Any] = field(default_factory=dict)
+    """Results that such a file brings, by the name under which they are handed over."""
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Settings of stages that such a file brings."""
+    setting_arrays: Mapping[tuple[str, str], Shaped[np.ndarray, "..."]] = field(
+        default_factory=dict
+    )
+    """Arrays that settings refer to, by stage and setting."""
 
     def pictures(
         self,

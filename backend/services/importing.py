@@ -28,7 +28,8 @@ from backend.jobs.journal import shot_document, shot_hash
 from backend.jobs.loading import NO_RIG
 from backend.methods import Registry
 from backend.services.capture_calibration import capture_calibration
-from backend.services.capture_folder import CaptureFolder, capture_facts, open_capture
+from backend.services.capture_folder import CaptureFolder, capture_facts
+from backend.services.capture_sources import open_source
 from backend.services.context import Context
 from backend.services.portable import read_array, read_back
 from backend.services.states import scan_state
@@ -69,7 +70,7 @@ class Importer:
         StorageFullError
             If there is no room for the frames.
         """
-        folder = open_capture(path)
+        folder = open_source(path)
         method = self.registry.get(folder.capture.method)
         plan = _ImportPlan(folder, method, read_scan_file(folder))
         calibration = plan.calibration()  # before hundreds of frames are read
@@ -174,6 +175,8 @@ class Importer:
             name = type(result).__name__
             if result is not None and name not in rows and type(result) in plan.method.given:
                 rows[name] = self._given_row(name, result)
+        for name, result in plan.folder.given.items():
+            rows[name] = self._given_row(name, result)
         for name, importer in plan.method.importers.items():
             frames = stored.given_to(name)
             if frames:
@@ -298,9 +301,9 @@ class _ImportPlan:
                 )
 
     def recipe(self, store: ArtifactStore) -> dict[str, dict[str, Any]]:
-        """Return the settings of the export that aren't today's defaults."""
+        """Return the settings of the export that aren't today's defaults, or those of another program's file."""
         if self.scan_file is None:
-            return {}
+            return self._settings_of_file(store)
         chosen: dict[str, dict[str, Any]] = {}
         for s in self.method.stages:
             written = self.scan_file.settings.get(s.name, {})
@@ -314,11 +317,18 @@ class _ImportPlan:
                 chosen[s.name] = values
         return check_recipe(self.method, None, chosen, store.__contains__)
 
+    def _settings_of_file(self, store: ArtifactStore) -> dict[str, dict[str, Any]]:
+        """Return the settings that another program's file brings."""
+        chosen = {stage: dict(values) for stage, values in self.folder.settings.items()}
+        for (stage, name), array in self.folder.setting_arrays.items():
+            chosen.setdefault(stage, {})[name] = store.put(array).hash
+        return check_recipe(self.method, None, chosen, store.__contains__)
+
     def calibration(self) -> RigCalibration | None:
         """Return the folder's own calibration, where an export doesn't bring the exact one."""
         if self.scan_file and RigCalibration.__name__ in self.scan_file.given:
             return None
-        return capture_calibration(self.folder.capture)
+        return self.folder.calibration or capture_calibration(self.folder.capture)
 
     def given_of_export(self, store: ArtifactStore) -> list[GivenRow]:
         """Return what was handed over with the exported scan, but for imported frames."""
