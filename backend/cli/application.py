@@ -14,6 +14,7 @@ from backend.cli import (
     reports,
     scanning,
     serving,
+    validating,
 )
 from backend.domain.errors import CancelledError, UnglareError
 
@@ -38,6 +39,7 @@ for group in (
     checking,
     comparing,
     reports,
+    validating,
     benchmarking,
 ):
     group.register(application)

@@ -112,12 +112,13 @@ def _report(make: Make, *, out: Path | None, data: Path | None, as_json: bool, q
         if out is not None:
             answer["files"] = [str(file) for file in write_report(out, found)]
     if not as_json and found is not None:
-        _show(found)
+        show_report(found)
         if out is not None:
             console().print(f"page, tables and pictures are in {out}")
 
 
-def _show(report: "Report") -> None:
+def show_report(report: "Report") -> None:
+    """Print tables and sentences."""
     out = console()
     out.print(report.title)
     for shown in report.tables:

@@ -144,7 +144,7 @@ def linearise(
 ) -> Linear:
     """Choose what fringes are read as: gray levels, ln E, or a table, by the phase error that each will have."""
     try:
-        candidates = _candidates(ramp, response, interval)
+        candidates = representations(ramp, response, interval)
         screen = _screen_response(ramp, response, facts)
         errors = {
             name: predict_phase_error(screen, shown.fringes, steps=params.steps)
@@ -174,15 +174,16 @@ def choose(error_rad: Mapping[str, float]) -> str:
     return DEFAULT if as_good else best
 
 
-class _Shown(NamedTuple):
-    """One representation."""
+class Shown(NamedTuple):
+    """How one representation shows and reads fringes."""
 
     fringes: Fringes
     quoted: Float[np.ndarray, "control"]
     """Quoted error over the control values that the fringes use."""
 
 
-def _candidates(ramp: Ramp, response: Response | None, interval: Interval) -> dict[str, _Shown]:
+def representations(ramp: Ramp, response: Response | None, interval: Interval) -> dict[str, Shown]:
+    """Make every representation that ramp, stack and interval allow, by name."""
     curve = monotone(ramp)
     levels = round(ramp.full_scale_gray) + 1
     control = control_of_gray(curve, levels)
@@ -202,7 +203,7 @@ def _candidates(ramp: Ramp, response: Response | None, interval: Interval) -> di
     table = inverse_table(curve, levels)
     shown["inverse"] = Fringes(table, within.control_low, within.control_high)
     shown["predistorted"] = Fringes(raw, -1.0, 1.0, predistortion(curve, within, levels))
-    return {name: _Shown(fringes, _quoted(ramp, fringes)) for name, fringes in shown.items()}
+    return {name: Shown(fringes, _quoted(ramp, fringes)) for name, fringes in shown.items()}
 
 
 def _quoted(ramp: Ramp, fringes: Fringes) -> Float[np.ndarray, "control"]:
@@ -233,7 +234,7 @@ def _screen_response(
     return ScreenResponse(ramp.control, ramp.gray, noise, ramp.full_scale_gray)
 
 
-def _row(name: str, shown: _Shown, error: PhaseError) -> PredictedError:
+def _row(name: str, shown: Shown, error: PhaseError) -> PredictedError:
     return PredictedError(
         representation=TITLES[name],
         error_mrad=1e3 * error.all_rad,
@@ -247,7 +248,7 @@ def _row(name: str, shown: _Shown, error: PhaseError) -> PredictedError:
 
 def _result(
     chosen: str,
-    candidates: Mapping[str, _Shown],
+    candidates: Mapping[str, Shown],
     rows: tuple[PredictedError, ...],
     ramp: Ramp,
     interval: Interval,
