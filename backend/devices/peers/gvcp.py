@@ -40,7 +40,7 @@ class Status(IntEnum):
     BUSY = 0x8007
 
 
-class Refusal(Exception):
+class RefusedError(Exception):
     """A command that a device doesn't carry out; the status says why."""
 
     def __init__(self, status: Status) -> None:

@@ -1,0 +1,123 @@
+"""A rig put together from single devices: any cameras, any projector."""
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from backend.devices.protocols import Camera, DeviceInfo, Projector
+from backend.domain.rig import CameraFacts, ProjectorFacts, RigCalibration, RigFacts
+
+
+@dataclass(frozen=True)
+class SensorFacts:
+    """What a camera's data sheet or a measurement says, and the camera itself doesn't."""
+
+    bit_depth: int = 8
+    black_level_gray: float = 0.0
+    """What a dark pixel reads, at `bit_depth`."""
+    full_well_e: float = 10_000.0
+    """Electrons at full scale, at gain 0 dB."""
+    read_noise_e: float = 10.0
+
+
+class AssembledRig:
+    """A `Rig` of devices that are made already, and closed again with it.
+
+    Parameters
+    ----------
+    name
+        Name under which the rig is opened.
+    cameras
+        By name; the first is the reference.
+    projector
+        Projector or screen.
+    sensors
+        What is known of each camera's sensor; sizes and ranges are read from the devices.
+    calibration
+        Where the devices are, if that is known.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        cameras: Mapping[str, Camera],
+        projector: Projector,
+        *,
+        sensors: Mapping[str, SensorFacts],
+        gamma: float = 1.0,
+        calibration: RigCalibration | None = None,
+    ) -> None:
+        self._name = name
+        self._cameras = dict(cameras)
+        self._projector = projector
+        self._sensors = dict(sensors)
+        self._gamma = gamma
+        self._calibration = calibration
+
+    @property
+    def name(self) -> str:
+        """Name under which it is opened."""
+        return self._name
+
+    @property
+    def info(self) -> DeviceInfo:
+        """Say what it is put together from."""
+        models = [d.info.model or d.name for d in (*self._cameras.values(), self._projector)]
+        return DeviceInfo("", " + ".join(models))
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """The cameras by name."""
+        return self._cameras
+
+    @property
+    def projector(self) -> Projector:
+        """The projector or screen."""
+        return self._projector
+
+    def open(self) -> None:
+        """Open every device; when one refuses, the others are closed again."""
+        with ExitStack() as undo:
+            for device in (self._projector, *self._cameras.values()):
+                device.open()
+                undo.callback(device.close)
+            undo.pop_all()
+
+    def close(self) -> None:
+        """Close every device."""
+        for device in (*self._cameras.values(), self._projector):
+            device.close()
+
+    def __enter__(self) -> "AssembledRig":
+        self.open()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def facts(self) -> RigFacts:
+        """Return sizes and ranges as the devices tell them, noise as the rig's owner measured it."""
+        cameras = {name: self._camera_facts(name) for name in self._cameras}
+        can = self._projector.capabilities
+        period_ms = 1000.0 / can.refresh_hz if can.refresh_hz else None
+        gamma = 1.0 if can.linear else self._gamma
+        return RigFacts(cameras, next(iter(cameras)), ProjectorFacts(*can.size, period_ms, gamma))
+
+    def calibration(self) -> RigCalibration | None:
+        """Return the calibration that was handed in."""
+        return self._calibration
+
+    def _camera_facts(self, name: str) -> CameraFacts:
+        can, sensor = self._cameras[name].capabilities, self._sensors[name]
+        width_px, height_px = can.sensor_size
+        return CameraFacts(
+            width_px=width_px,
+            height_px=height_px,
+            bit_depth=sensor.bit_depth,
+            exposure_min_ms=can.exposure_us.min / 1000.0,
+            exposure_max_ms=can.exposure_us.max / 1000.0,
+            black_level_gray=sensor.black_level_gray,
+            full_well_e=sensor.full_well_e,
+            read_noise_e=sensor.read_noise_e,
+            gain_max_db=can.gain_db.max,
+        )

@@ -1,0 +1,192 @@
+"""GigE Vision for real: the Aravis driver against cameras that speak the protocol, over loopback."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from backend.devices.assembled import AssembledRig, SensorFacts
+from backend.devices.conformance import RigConformance
+from backend.devices.drivers.aravis_camera import AravisCamera, AravisOptions
+from backend.devices.drivers.aravis_library import AravisMissingError, aravis
+from backend.devices.errors import (
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceNotFound,
+    DeviceTimeout,
+    FeatureError,
+    IncompleteFrame,
+)
+from backend.devices.peers.gige_camera import GigECamera, Wire
+from backend.devices.peers.gvcp import ask
+from backend.devices.protocols import LinkState, TriggerSource
+from backend.devices.sim import create_rig
+
+try:
+    aravis()
+except AravisMissingError as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+pytestmark = pytest.mark.xdist_group("gige-vision")
+
+SCENE = {"scene": "plane", "size": "160x120", "projector_size": "160x100", "realtime": True}
+
+
+@pytest.fixture
+def addresses(worker_id: str) -> tuple[str, str]:
+    """Two addresses that no other test process uses: all of 127.0.0.0/8 is this machine."""
+    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 99
+    return f"127.77.{number}.2", f"127.77.{number}.3"
+
+
+@contextmanager
+def network(
+    addresses: tuple[str, str], wire: Wire | None = None, **options: object
+) -> Iterator[tuple[object, list[GigECamera]]]:
+    """Serve the cameras of a simulated rig."""
+    simulated = create_rig({**SCENE, **options})
+    with simulated, ExitStack() as stack:
+        peers = [
+            stack.enter_context(GigECamera(camera, address, wire))
+            for camera, address in zip(simulated.cameras.values(), addresses, strict=True)
+        ]
+        yield simulated, peers
+
+
+class TestAravisOnGigEVision(RigConformance):
+    has_light = True
+
+    @pytest.fixture
+    def rig(self, addresses):
+        with network(addresses) as (simulated, _):
+            cameras = {
+                name: AravisCamera(name, AravisOptions(address))
+                for name, address in zip(("left", "right"), addresses, strict=True)
+            }
+            sensors = dict.fromkeys(cameras, SensorFacts(8, 4.0, 15_300.0, 12.0))
+            with AssembledRig("bench", cameras, simulated.projector, sensors=sensors) as rig:
+                yield rig
+
+
+def opened(addresses: tuple[str, str], **options: object) -> AravisCamera:
+    camera = AravisCamera("left", AravisOptions(addresses[0], **options))
+    camera.open()
+    camera.configure(replace(camera.settings, exposure_us=10_000.0))
+    return camera
+
+
+def test_known_addresses_are_asked_one_by_one(addresses):
+    with network(addresses):
+        found = ask([*addresses, "127.77.200.200"])
+    assert {f.address: f.serial for f in found} == dict(
+        zip(addresses, ("SIM-L", "SIM-R"), strict=True)
+    )
+
+
+def test_nobody_at_the_address_is_one_sentence(addresses):
+    camera = AravisCamera("left", AravisOptions(addresses[0]))
+    with pytest.raises(DeviceNotFound, match=f"left: no camera answers at {addresses[0]}"):
+        camera.open()
+    assert camera.state is LinkState.CLOSED
+
+
+def test_a_second_controller_is_refused(addresses):
+    with network(addresses), opened(addresses) as camera:
+        other = AravisCamera("other", AravisOptions(addresses[0]))
+        with pytest.raises(DeviceBusy, match="another program controls"):
+            other.open()
+        camera.arm()
+        camera.trigger()
+        assert camera.get_frame().data.shape == (120, 160)
+
+
+def test_lost_packets_are_asked_for_again(addresses):
+    with network(addresses, Wire(loss=0.05, seed=3), size="640x480") as (_, peers):
+        with opened(addresses, packet_bytes=1500) as camera:
+            camera.arm()
+            for _ in range(10):
+                camera.trigger()
+                camera.get_frame()
+        assert peers[0].resent_packets > 20
+
+
+def test_what_resending_cannot_save_is_an_incomplete_frame_and_the_next_one_is_whole(addresses):
+    wire = Wire(loss=1.0)
+    with network(addresses, wire) as (_, peers), opened(addresses, packet_bytes=1500) as camera:
+        camera.arm()
+        camera.trigger()
+        with pytest.raises((IncompleteFrame, DeviceTimeout), match="left"):
+            camera.get_frame()
+        peers[0]._wire = Wire()
+        camera.trigger()
+        camera.get_frame()
+
+
+def test_a_trigger_during_an_exposure_is_lost(addresses):
+    """The driver waits for the exposure's end; whoever doesn't gets no frame."""
+    with network(addresses) as (_, peers), opened(addresses) as camera:
+        camera.configure(replace(camera.settings, exposure_us=200_000.0))
+        camera.arm()
+        camera.trigger()
+        camera._free_at_s = 0.0
+        camera.trigger()
+        camera.get_frame()
+        with pytest.raises(DeviceTimeout):
+            camera.get_frame(timeout_s=0.3)
+        assert peers[0].dropped_triggers == 1
+
+
+def test_a_camera_that_goes_away_and_comes_back(addresses):
+    with network(addresses) as (_, peers), opened(addresses) as camera:
+        wanted = camera.settings
+        camera.arm()
+        peers[0].stop()
+        with pytest.raises(DeviceDisconnected, match="left"):
+            camera.trigger()
+        assert camera.state is LinkState.LOST
+        threading.Timer(0.5, peers[0].start).start()
+        camera.reconnect(timeout_s=20.0)
+        assert camera.settings == wanted
+        camera.arm()
+        camera.trigger()
+        camera.get_frame()
+
+
+def test_control_ends_with_the_heartbeat_of_a_client_that_died(addresses):
+    with network(addresses) as (_, peers), opened(addresses) as camera:
+        peers[0]._client = ("127.0.0.1", 9)  # somebody who never says anything again
+        peers[0]._heard_s = time.monotonic()
+        with pytest.raises((DeviceBusy, DeviceDisconnected, FeatureError)):
+            camera.configure(replace(camera.settings, exposure_us=20_000.0))
+        camera.reconnect(timeout_s=20.0)
+        assert camera.state is LinkState.READY
+
+
+def test_a_line_triggered_sequence_brings_every_frame(addresses):
+    """24 patterns at 16.7 ms: 24 frames of each camera, equally spaced by its own clock."""
+    steady = network(addresses, frame_period_ms=None)  # light that isn't modulated within 16.7 ms
+    with steady as (simulated, _), ExitStack() as stack:
+        projector = simulated.projector
+        patterns = [np.full((100, 160), 10 * k, np.uint8) for k in range(24)]
+        projector.load(patterns)
+        cameras = []
+        for name, address in zip(("left", "right"), addresses, strict=True):
+            camera = stack.enter_context(AravisCamera(name, AravisOptions(address)))
+            camera.configure(
+                replace(camera.settings, exposure_us=12_000.0, trigger=TriggerSource.LINE1)
+            )
+            camera.arm(24)
+            cameras.append(camera)
+        projector.arm_sequence(range(24), 16_000.0, 16_667.0)
+        projector.start_sequence()
+        for camera in cameras:
+            frames = [camera.get_frame(timeout_s=5.0) for _ in range(24)]
+            spacing_s = np.diff([f.timestamp_s for f in frames])
+            np.testing.assert_allclose(spacing_s, 0.016667, atol=1e-6)
+            assert np.unique(np.diff([f.frame_id for f in frames])).tolist() == [1]
+            means = [float(f.data.mean()) for f in frames]
+            assert means == sorted(means)
