@@ -40,7 +40,10 @@ def register(application: typer.Typer) -> None:
 
 def import_capture(
     capture: Annotated[
-        Path, typer.Argument(metavar="CAPTURE", help="capture.json, or the folder it is in.")
+        Path,
+        typer.Argument(
+            metavar="CAPTURE", help="capture.json or its folder, or a SOFAST measurement."
+        ),
     ],
     name: Annotated[str, typer.Option(help="Name of the scan; else the capture's.")] = "",
     settings: Settings = None,
@@ -59,7 +62,7 @@ def import_capture(
             refuse_place(services, out)
             state = services.import_capture(str(capture), name, who(), progress.part("import"))
             answer.update(describe_scan(state))
-            _apply(services, state.id, with_uploads(services, state.method, changes))
+            edit_settings(services, state.id, with_uploads(services, state.method, changes))
             if run:
                 run_and_export(services, state.id, answer, progress, out=out, frames=frames)
             progress.finish()
@@ -67,7 +70,7 @@ def import_capture(
         show_summary(answer)
 
 
-def _apply(services: "Services", scan: str, changes: dict[str, dict[str, Any]]) -> None:
+def edit_settings(services: "Services", scan: str, changes: dict[str, dict[str, Any]]) -> None:
     """Edit the imported scan's settings: an import has no recipe of its own."""
     from backend.contract.requests import EditSettings
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from backend.domain.frames import Frame
 from backend.domain.rig import RigCalibration, RigFacts
-from backend.domain.stage import Input, Stage
+from backend.domain.stage import Input, Stage, read_inputs
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,9 @@ class Method:
     """How imported frames become the result of a capturing stage: `{stage: function of frames}`, or, where
     the method doesn't capture them itself, a given result: `{name of its type: function of frames}`.
     Frames that name no stage belong to the first one."""
+    files: Mapping[str, Callable[..., bytes]] = field(default_factory=dict)
+    """Files that an export holds beside cloud and maps: `{name: function of results}`. The function's parameters are
+    wired by their types, as a stage's inputs; without one that is required there is no such file."""
 
     def __post_init__(self) -> None:
         """Refuse, at import, names used twice and inputs that nothing can make."""
@@ -47,6 +50,13 @@ class Method:
             )
         for s in self.stages:
             self._wire(s)
+        for name in self.files:
+            self.file_wires(name)
+
+    def file_wires(self, name: str) -> tuple[Wire, ...]:
+        """Return where the inputs of a file come from."""
+        inputs = read_inputs(f"file {name!r}", self.files[name])
+        return tuple(self._wire_input(f"file {name!r}", i, self.stages) for i in inputs)
 
     @cached_property
     def wires(self) -> Mapping[str, tuple[Wire, ...]]:
@@ -105,15 +115,16 @@ class Method:
 
     def _wire(self, reader: Stage) -> tuple[Wire, ...]:
         earlier = self.stages[: self.stages.index(reader)]
-        return tuple(self._wire_input(reader, i, earlier) for i in reader.inputs)
+        who = f"stage {reader.name!r}"
+        return tuple(self._wire_input(who, i, earlier) for i in reader.inputs)
 
-    def _wire_input(self, reader: Stage, wanted: Input, earlier: tuple[Stage, ...]) -> Wire:
+    def _wire_input(self, reader: str, wanted: Input, earlier: tuple[Stage, ...]) -> Wire:
         makers = [s for s in earlier if s.output is wanted.type]
         if makers:
             return Wire(wanted, makers[-1].name)
         if wanted.type in self.given or wanted.optional:
             return Wire(wanted, None)
         raise TypeError(
-            f"method {self.name!r}: stage {reader.name!r} reads {wanted.name!r}, a {wanted.type.__name__}, "
+            f"method {self.name!r}: {reader} reads {wanted.name!r}, a {wanted.type.__name__}, "
             f"which no earlier stage makes and which isn't given"
         )

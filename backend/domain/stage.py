@@ -218,13 +218,28 @@ def _read_signature(function: Callable[..., Any]) -> dict[str, Any]:
     load = _take(hints, LoadArray)
     return {
         "params": params,
-        "inputs": tuple(_read_input(name, n, annotation) for n, annotation in hints.items()),
+        "inputs": tuple(
+            _read_input(f"stage {name!r}", n, annotation) for n, annotation in hints.items()
+        ),
         "output": output,
         "captures": shoot is not None,
         "shoot_argument": shoot,
         "progress_argument": progress,
         "load_argument": load,
     }
+
+
+def read_inputs(who: str, function: Callable[..., Any]) -> tuple[Input, ...]:
+    """Return what a function reads, all of its parameters being results: `X`, or `X | None` where it can do without.
+
+    Raises
+    ------
+    TypeError
+        At import, if a parameter isn't annotated so.
+    """
+    hints = typing.get_type_hints(function)
+    hints.pop("return", None)
+    return tuple(_read_input(who, n, annotation) for n, annotation in hints.items())
 
 
 def _is_frozen(result_type: Any) -> bool:
@@ -239,12 +254,12 @@ def _take(hints: dict[str, Any], wanted: type) -> str | None:
     return None
 
 
-def _read_input(stage_name: str, name: str, annotation: Any) -> Input:
+def _read_input(who: str, name: str, annotation: Any) -> Input:
     members = [annotation]
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         members = [m for m in typing.get_args(annotation) if m is not type(None)]
     if len(members) != 1 or not isinstance(members[0], type):
-        raise TypeError(f"stage {stage_name!r}: input {name!r} has to be one type or `Type | None`")
+        raise TypeError(f"{who}: input {name!r} has to be one type or `Type | None`")
     return Input(name, members[0], optional=members[0] is not annotation)
 
 

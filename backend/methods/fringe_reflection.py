@@ -10,6 +10,7 @@ from backend.stages.camera_response import camera_response
 from backend.stages.interval import interval
 from backend.stages.linearise import linearise
 from backend.stages.mirror_cloud import mirror_cloud
+from backend.stages.mirror_files import result_npz, summary_json, surface_csv, surface_h5
 from backend.stages.ramp import Ramp, ramp
 from backend.stages.reflect_capture import reflect_capture, reflect_frames
 from backend.stages.screen_phase import screen_phase
@@ -34,5 +35,11 @@ METHOD = Method(
         mirror_cloud,
     ),
     given=(RigFacts, RigCalibration, Ramp),
+    files={
+        "result.npz": result_npz,
+        "summary.json": summary_json,
+        "surface.csv": surface_csv,
+        "surface.h5": surface_h5,
+    },
     importers={"reflect_capture": reflect_frames, "stack": import_stack},
 )

@@ -20,6 +20,7 @@ from backend.contract.scan_file import (
 from backend.contract.scans import ScanState, StageState
 from backend.domain.arrays import array_hashes
 from backend.domain.errors import ConflictError
+from backend.domain.method import Wire
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.shots import Progress
 from backend.jobs.loading import LoadedScan, load_scan
@@ -36,12 +37,13 @@ from backend.services.export_folder import (
 from backend.services.handed import takers
 from backend.services.ply import ply_parts
 from backend.services.portable import written_out
-from backend.services.reporting import load_cloud, report
+from backend.services.reporting import document_of, load_cloud, report
 from backend.services.states import scan_state
 from backend.services.telling import announce
 from backend.stages.cloud import Cloud
 from backend.storage.artifacts import ArtifactStore
 from backend.storage.codec import decode
+from backend.storage.repositories import Repositories
 from backend.storage.rows import AuditRow, DecisionRow, EditRow, FrameRow, GivenRow, RunRow
 
 _MAPS = ("picture", "mask")
@@ -59,7 +61,8 @@ def export_scan(
     """Write a scan's present results into a folder and return its files.
 
     `scan.json` (how the scan came about, see `contract.scan_file`), `cloud.ply`,
-    `maps/<stage>.<field>[.<camera>].npy` for every shown map, `arrays/` for what settings refer to, and with `frames` the captured frames in the
+    the method's own files, `maps/<stage>.<field>[.<camera>].npy` for every shown map,
+    `arrays/` for what settings refer to, and with `frames` the captured frames in the
     import format, so that importing the folder gives the same results again. The folder appears whole or not
     at all; an older export in its place is replaced.
 
@@ -133,6 +136,8 @@ class _Content:
     audit: tuple[AuditRow, ...]
     facts: RigFacts | None
     calibration: RigCalibration | None
+    files: Mapping[str, Mapping[str, Any]]
+    """The method's own files whose results are there, with the arguments of their functions."""
 
     @classmethod
     def read(cls, context: Context, scan: str) -> "_Content":
@@ -152,6 +157,7 @@ class _Content:
                 audit=tuple(repositories.audit.of(scan)),
                 facts=_given(loaded, RigFacts, context.store),
                 calibration=_given(loaded, RigCalibration, context.store),
+                files=_files(loaded, repositories, context.store),
             )
 
     @property
@@ -230,9 +236,36 @@ def _given(loaded: LoadedScan, kind: type, store: ArtifactStore) -> Any:
     return decode(row.document, kind, store) if row else None
 
 
+def _files(
+    loaded: LoadedScan, repositories: Repositories, store: ArtifactStore
+) -> dict[str, dict[str, Any]]:
+    """Collect what the method's own files are made of; a file that lacks something isn't there."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in loaded.method.files:
+        arguments = {}
+        for wire in loaded.method.file_wires(name):
+            result = _result(loaded, wire)
+            kind = wire.input.type
+            document = None if result is None else document_of(repositories, result)
+            arguments[wire.input.name] = None if document is None else decode(document, kind, store)
+            if document is None and not wire.input.optional:
+                break
+        else:
+            found[name] = arguments
+    return found
+
+
+def _result(loaded: LoadedScan, wire: Wire) -> GivenRow | RunRow | None:
+    if wire.source is None:
+        return loaded.given.get(wire.input.type.__name__)
+    return loaded.plan.stage(wire.source).result
+
+
 def _write_results(target: ExportFolder, content: _Content, store: ArtifactStore) -> None:
     if content.cloud is not None:
         target.write("cloud.ply", ply_parts(content.cloud))
+    for name, arguments in content.files.items():
+        target.write(name, (content.loaded.method.files[name](**arguments),))
     for name, array in _maps(content.state, store):
         target.write_array(f"maps/{name}.npy", array)
 

@@ -144,18 +144,14 @@ def _gray(of_one: FringeSteps, chosen: Chosen) -> Shaped[np.ndarray, "step pixel
     return np.stack([step.frame.gray.ravel()[chosen] for step in of_one.equal])
 
 
-def ramp_verdict(
-    one: AxisSets,
-    position: ScreenPosition,
-    chosen: Chosen,
-    values: Table,
-) -> RampVerdict | None:
+def ramp_verdict(one: AxisSets, chosen: Chosen, values: Table) -> RampVerdict | None:
     """Learn the response from the fringes and read them through a ramp's values; None if they don't tell it.
 
     The set that is looked at is the coarsest with two fringes in view: its phase follows from the finer ones,
-    and blur leaves it alone.
+    and blur leaves it alone. Positions are found from gray levels as captured: whatever bends the finest phase moves
+    them by a small part of the finest fringe only.
     """
-    share = position.share.ravel()[chosen]
+    share = _position(one, chosen, None).share[0]
     known = share[np.isfinite(share)]
     if known.size == 0 or len(one.sets) < 2:
         return None

@@ -39,12 +39,14 @@ from backend.stages.fringe_checks import (
 from backend.stages.linearise import Linear
 from backend.stages.ramp import Ramp, monotone
 from backend.stages.reflect_capture import ReflectFrames
-from backend.stages.reflect_sets import AxisSets, Step, axis_sets, mask_fields
+from backend.stages.reflect_sets import AxisSets, FringeSteps, Step, axis_sets, mask_fields
 
 Reading = Literal["linear", "ramp", "gray"]
 
 DEFECT_RADIUS_SHARE = 0.02
 """Surroundings of a defect, as part of the picture's width."""
+MOST_RIPPLES_PER_PX = 0.9
+"""Once per pixel, a ripple looks like the mirror's shape."""
 FIELD_SHARE = 0.15
 """Of the brightest change between dark and light field: where the screen changes less there is no mirror."""
 
@@ -54,7 +56,7 @@ class ScreenPhaseParams(Params):
 
     reading: Reading | None = setting(None, title="Gray levels as", auto="reading")
     """linear: through the chosen representation; ramp: through the inverse of the ramp on file; gray: as captured.
-    Automatic: linear where there is a linearisation, else the ramp if it belongs to the fringes, else gray."""
+    Automatic: linear where there is a linearisation, else the ramp; gray where fringes are straighter that way."""
     modulation_min_gray: float = setting(3.0, title="Least modulation", unit="gray", ge=0, le=1000)
     """Amplitude of the finest fringes in captured gray levels."""
     residual_max_cycles: float = setting(
@@ -86,7 +88,8 @@ class FringeRow:
     closure: float
     """Rms departure from a sinusoid over the modulation; NaN for three steps."""
     ripple_mrad: float
-    """Amplitude of the phase error that repeats once per step: what a response that isn't linear leaves."""
+    """Amplitude of the phase error that repeats once per step: what a response that isn't linear leaves. NaN for the
+    finest fringes where a pixel takes in so much of one that its repetition can't be seen."""
 
 
 @dataclass(frozen=True)
@@ -251,9 +254,7 @@ class _Camera:
     reasons: UInt16[np.ndarray, "h w"]
     rows: tuple[FringeRow, ...]
     findings: tuple[FrameFinding, ...]
-    verdict: RampVerdict | None
-    belongs: bool | None
-    reading: Reading
+    read: "_Read"
     left_out: tuple[int, ...]
     sigma_mrad: Float32[np.ndarray, "h w"]
 
@@ -289,45 +290,63 @@ def _decode(
 ) -> _Camera:
     mirror = _mirror_mask(camera, sets, frames, params, load)
     chosen = _telling_pixels(mirror, sets)
-    table, kind = _table(linear, ramp, params)
-    values = table if kind == "linear" or params.reading == kind else None
-    closure = set_closures(sets, chosen, values)
-    findings = defective_frames(sets, closure, chosen, values)
+    read = _read(sets, chosen, linear, ramp, params)
+    closure = set_closures(sets, chosen, read.values)
+    findings = defective_frames(sets, closure, chosen, read.values)
     left_out = params.leave_out
     if left_out is None:
         left_out = tuple(f.number for f in findings if f.number is not None)
     used = tuple(one.without(frozenset(left_out)) for one in sets)
-    positions = _positions(used, values)
-    verdict, belongs = None, None
-    if table is not None:
-        verdict = ramp_verdict(used[0], positions[used[0].axis], chosen, table)
-        belongs = None if verdict is None else verdict.belongs
-        if params.reading is None and kind == "ramp" and verdict is not None and belongs:
-            values = table
-            positions = _positions(used, values)
-    reading: Reading = "gray" if values is None else kind
+    if left_out:
+        read = _read(used, chosen, linear, ramp, params)
+    positions: dict[str, ScreenPosition] = {
+        one.axis: screen_position([f.gray for f in one.frames], one.code, read.values)
+        for one in used
+    }
     reasons = _reasons(camera, used, positions, mirror, facts, params)
     valid = reasons == 0
     return _Camera(
         camera, used, positions, mirror, reasons, _rows(used, positions, valid, closure), findings,
-        verdict, belongs, reading, left_out, _sigma_mrad(camera, used[0], positions, facts),
+        read, left_out, _sigma_mrad(camera, used[0], positions, facts),
     )  # fmt: skip
 
 
-def _positions(
-    sets: tuple[AxisSets, ...], values: Float[np.ndarray, "level"] | None
-) -> dict[str, ScreenPosition]:
-    return {
-        one.axis: screen_position([f.gray for f in one.frames], one.code, values) for one in sets
-    }
+@dataclass(frozen=True)
+class _Read:
+    """How gray levels are read, and why."""
+
+    values: Float[np.ndarray, "level"] | None
+    reading: Reading
+    verdict: RampVerdict | None
+    """What the fringes say of the table at hand; None: there is none, or they don't tell."""
+
+
+def _read(
+    sets: tuple[AxisSets, ...],
+    chosen: Chosen,
+    linear: Linear | None,
+    ramp: Ramp | None,
+    params: ScreenPhaseParams,
+) -> _Read:
+    """Choose: as set, else through the table at hand unless the fringes are straighter without it."""
+    table, kind = _table(linear, ramp, params)
+    if table is None:
+        return _Read(None, "gray", None)
+    verdict = ramp_verdict(sets[0], chosen, table)
+    use = kind == "linear"
+    if params.reading is not None:
+        use = params.reading != "gray"
+    elif verdict is not None:
+        use = verdict.belongs or verdict.table_error_percent < verdict.raw_error_percent
+    return _Read(table if use else None, kind if use else "gray", verdict)
 
 
 def _table(
     linear: Linear | None, ramp: Ramp | None, params: ScreenPhaseParams
 ) -> tuple[Float[np.ndarray, "level"] | None, Reading]:
     """Return the linear value of each gray level that is at hand, and where it comes from."""
-    if linear is not None and params.reading in (None, "linear", "gray"):
-        return linear.values, "linear" if params.reading != "gray" else "gray"
+    if linear is not None and params.reading != "ramp":
+        return linear.values, "linear"
     if params.reading == "linear":
         raise InvalidSettingError(
             "There is no linearisation to read the fringes through: choose gray or the ramp."
@@ -436,9 +455,10 @@ def _rows(
             finest = place == len(one.sets) - 1
             ripple = float("nan")
             if one.periods[0] <= 1:
+                smooth = _without_fringes(share, of_one) if finest else share
                 ripple = phase_ripple_rad(
                     found.wrapped_rad[place],
-                    _without_fringes(share, of_one.periods) if finest else share,
+                    smooth,
                     periods=of_one.periods,
                     harmonic=len(of_one.equal),
                 )
@@ -456,13 +476,16 @@ def _rows(
 
 
 def _without_fringes(
-    share: Float32[np.ndarray, "h w"], periods: float
+    share: Float32[np.ndarray, "h w"], finest: FringeSteps
 ) -> Float32[np.ndarray, "h w"]:
-    """Smooth positions over about a fringe, so that its ripple is gone."""
-    step = np.nanmedian(np.abs(np.diff(share, axis=1)))
-    step = max(float(step), float(np.nanmedian(np.abs(np.diff(share, axis=0)))), 1e-9)
-    fringe_px = 1.0 / (periods * step)
-    return smoothed(share, sigma_px=float(np.clip(fringe_px, 2.0, 15.0))).astype(np.float32)
+    """Smooth positions over about a fringe, so that its ripple is gone; NaN where pixels are too coarse for that."""
+    steps = [np.abs(np.diff(share, axis=axis)) for axis in (0, 1)]
+    known = [float(np.median(s[np.isfinite(s)])) for s in steps if np.isfinite(s).any()]
+    cycles_per_px = finest.periods * max(known, default=0.0)
+    if not 0.0 < cycles_per_px * len(finest.equal) <= MOST_RIPPLES_PER_PX:
+        return np.full(share.shape, np.nan, np.float32)
+    sigma_px = float(np.clip(1.0 / cycles_per_px, 2.0, 15.0))
+    return smoothed(share, sigma_px=sigma_px).astype(np.float32)
 
 
 def _modulation_gray(steps: tuple[Step, ...], valid: Bool[np.ndarray, "h w"]) -> float:
@@ -526,18 +549,22 @@ def _summarise(cameras: list[_Camera]) -> ScreenPhase:
         mirror={c.name: c.mirror.astype(np.uint16) for c in cameras},
         sets=tuple(row for c in cameras for row in c.rows),
         findings=tuple(f for c in cameras for f in c.findings),
-        response_gray=np.zeros(0) if first.verdict is None else first.verdict.learned.gray,
-        response_cosine=np.zeros(0) if first.verdict is None else first.verdict.learned.cosine,
-        reading=first.reading,
+        response_gray=np.zeros(0)
+        if first.read.verdict is None
+        else first.read.verdict.learned.gray,
+        response_cosine=np.zeros(0)
+        if first.read.verdict is None
+        else first.read.verdict.learned.cosine,
+        reading=first.read.reading,
         valid_share=sum(int(v.sum()) for v in valid.values()) / max(mirror, 1),
         median_sigma_mrad=float(np.median(known)) if known.size else float("nan"),
         ramp_error_percent=float("nan")
-        if first.verdict is None
-        else first.verdict.table_error_percent,
+        if first.read.verdict is None
+        else first.read.verdict.table_error_percent,
         gray_error_percent=float("nan")
-        if first.verdict is None
-        else first.verdict.raw_error_percent,
-        ramp_belongs=first.belongs,
+        if first.read.verdict is None
+        else first.read.verdict.raw_error_percent,
+        ramp_belongs=None if first.read.verdict is None else first.read.verdict.belongs,
         left_out=first.left_out,
         wrapped_x_rad=wrapped["x"],
         wrapped_y_rad=wrapped["y"],

@@ -327,16 +327,18 @@ def _design(params: SlopesParams, found: MirrorSlopes, load: LoadArray) -> Surfa
     """Return what errors are counted against."""
     if params.design == "map":
         return _design_map(params, load)
-    return Surface(_second_order(found.fit)) if params.design == "fit" else _design_surface(params)
+    return (
+        Surface(second_order(found.fit.coefficients))
+        if params.design == "fit"
+        else _design_surface(params)
+    )
 
 
-def _second_order(surface: Surface) -> Float64[np.ndarray, "6"]:
-    """Return the terms up to order 2."""
-    if surface.coefficients.size == 6:
-        return np.asarray(surface.coefficients)
-    order = surface.order
+def second_order(coefficients: Float[np.ndarray, "terms"]) -> Float64[np.ndarray, "6"]:
+    """Return the coefficients of 1 x x^2 y xy y^2 among those of any order."""
+    order = Surface(coefficients).order
     places = [0, 1, 2, order + 1, order + 2, 2 * order + 1]
-    return np.asarray(surface.coefficients[places])
+    return np.asarray(coefficients[places], np.float64)
 
 
 def _describe(
@@ -360,7 +362,7 @@ def _describe(
     error = found.slopes - design.slopes(x, y)
     valid = np.isfinite(found.slopes).all(axis=1)
     bent = curvature(x_mm, y_mm, slope_x, slope_y, sigma_px=params.curvature_px)
-    shape = _second_order(found.fit)
+    shape = second_order(found.fit.coefficients)
     name = scene.camera
     return Slopes(
         slope_x_mrad={name: (1e3 * slope_x).astype(np.float32)},
