@@ -2,6 +2,9 @@
 
 from importlib import import_module
 
+MIRROR = ("backend.numerics.screen_phase", "backend.numerics.slope_integration")
+"""What a mirror's processing needs."""
+
 MODULES = (
     "backend.numerics.absolute_phase",
     "backend.numerics.phasors",
@@ -11,15 +14,16 @@ MODULES = (
     "backend.numerics.edge_positions",
     "backend.numerics.warm_up_geometry",
     "backend.numerics.gathering",
+    *MIRROR,
 )
 """Modules with kernels: each has a function `warm_up_kernels()` that runs them on tiny arrays."""
 
 
-def warm_up() -> None:
+def warm_up(modules: tuple[str, ...] = MODULES) -> None:
     """Run every kernel once on tiny arrays; one compilation serves uint8 and uint16 frames.
 
     Takes minutes where nothing is compiled yet, a second or two from the cache; call it in a thread
     of its own: kernels release the GIL.
     """
-    for name in MODULES:
+    for name in modules:
         import_module(name).warm_up_kernels()
