@@ -12,8 +12,10 @@ from backend.stages.code_cloud import code_cloud
 from backend.stages.code_frames import import_code_frames
 from backend.stages.edges import edges
 from backend.stages.flat_mask import flat_mask
+from backend.stages.joined_codes import joined_codes
 from backend.stages.pixel_response import pixel_response
 from backend.stages.refine import refine
+from backend.stages.second_look import second_look
 from backend.stages.table_homography import TableHomography
 
 METHOD = Method(
@@ -29,6 +31,8 @@ METHOD = Method(
         refine.named("refine_3"),
         code_capture,
         edges,
+        second_look,
+        joined_codes,
         code_cloud,
     ),
     given=(RigFacts, RigCalibration, TableHomography),
