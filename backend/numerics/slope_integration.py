@@ -168,23 +168,28 @@ def _solve(
     """Conjugate gradients; the system is singular (heights have no zero) but consistent."""
     solution = np.zeros_like(wanted)
     residual = wanted.copy()
-    goal = tolerance * float(np.sqrt(np.vdot(residual, residual)))
+    goal = tolerance * np.sqrt(_dot(residual, residual))
     if goal == 0.0:
         return solution, 0
     direction, product = np.zeros_like(wanted), np.empty_like(wanted)
     before = 1.0
     for round_ in range(1, _MOST_ROUNDS + 1):
         better = _v_cycle(levels, residual, 0)
-        now = float(np.vdot(residual, better))
+        now = _dot(residual, better)
         direction = better + (now / before if round_ > 1 else 0.0) * direction
         _apply(*levels[0], direction, product)
-        step = now / float(np.vdot(direction, product))
+        step = now / _dot(direction, product)
         solution += step * direction
         residual -= step * product
         before = now
-        if float(np.sqrt(np.vdot(residual, residual))) <= goal:
+        if np.sqrt(_dot(residual, residual)) <= goal:
             break
     return solution, round_
+
+
+def _dot(a: Float64[np.ndarray, "h w"], b: Float64[np.ndarray, "h w"]) -> float:
+    """Multiply and sum without BLAS, whose threads would go on spinning between these short calls."""
+    return float(np.einsum("ij,ij->", a, b))
 
 
 def _v_cycle(
