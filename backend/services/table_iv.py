@@ -20,7 +20,14 @@ from backend.services.context import Context
 from backend.services.measured import Measured
 from backend.services.report_document import Figure, Report
 from backend.services.reporting import compare_with_truth, error_map, reference_camera, rig_truth
-from backend.services.table_iv_tables import SHOWN, detail_table, findings, points_table
+from backend.services.table_iv_tables import (
+    DECODINGS,
+    SHOWN,
+    decoding_table,
+    detail_table,
+    findings,
+    points_table,
+)
 from backend.services.variants import (
     SettingsOfStages,
     Variant,
@@ -46,7 +53,8 @@ _INTRODUCTION = (
     "is the same scene sprayed matte white, measured without a mask at the longest exposure that saturates nothing.",
     "Middle exposure: the geometric mean of the longest exposure that saturates nothing of the unsprayed scene and the "
     "high one. Completeness against the sprayed scan: good points of a part over good points of the same part when "
-    "sprayed; a point is good if it is off by at most 0.5 mm. Decoding beside the usual one: dual compares pattern and "
+    "sprayed; a point is good if it is off by at most 0.5 mm. White - black: by how many projector pixels white stripes "
+    "are wider than black ones, median of the part (the paper's figures 17 and 19). Decoding beside the usual one: dual compares pattern and "
     "inverse without a margin, fixed compares each pattern with half of the full scale.",
     DEFINITION,
 )
@@ -131,7 +139,7 @@ def _variants(no_mask: SettingsOfStages, exposures: _Exposures) -> tuple[Variant
             Variant(
                 f"{name}_{decoding}", f"{title}, {decoding} decoding", fixed(settings, decoding)
             )
-            for decoding in ("dual", "fixed")
+            for decoding in DECODINGS
         ]
     return tuple(found)
 
@@ -254,7 +262,8 @@ def _panels(
     white = mask.white[name] if masked else base.white[name]
     depths = truth.points_mm[..., 2][truth.lit_and_seen]
     low, high = np.nanpercentile(depths, [1, 99]).tolist()
-    panels = [
+    return (
+        Panel("intensity mask", drawn(mask.factor, limits=(0.0, 1.0))),
         Panel(f"white field, {base.exposure_ms:.0f} ms", drawn(white)),
         Panel("projector column", drawn(codes.projector_px[name], "turbo")),
         Panel("missing because", drawn(cloud.reasons[name], kind="mask")),
@@ -263,10 +272,7 @@ def _panels(
             f"off the truth, -{_ERROR_MM} to {_ERROR_MM} mm",
             drawn(error_map(cloud, truth), "turbo", (-_ERROR_MM, _ERROR_MM)),
         ),
-    ]
-    if mask.round:
-        panels.insert(1, Panel("intensity mask", drawn(mask.factor, limits=(0.0, 1.0))))
-    return tuple(panels)
+    )
 
 
 def _depth_mm(cloud: Cloud, truth: Truth) -> Float32[np.ndarray, "h w"]:
@@ -289,7 +295,11 @@ def _report(
         name="table-iv",
         title=f"Completeness with and without the intensity mask: {scene}",
         introduction=_INTRODUCTION,
-        tables=(points_table(reference, results), detail_table(reference, everything)),
+        tables=(
+            points_table(reference, results),
+            detail_table(reference, everything),
+            decoding_table(results),
+        ),
         figures=(
             Figure(
                 "table_iv",

@@ -6,20 +6,26 @@ from typing import Any
 from backend.services.measured import WHOLE, Measured, known, ratio
 from backend.services.report_document import Column, ReportTable
 
-SHOWN = ("no_mask_middle", "no_mask_high", "mask")
-"""Variants beside the sprayed scene, in the order of the paper's columns."""
+SHOWN = {
+    "no_mask_middle": "no mask, middle",
+    "no_mask_high": "no mask, high",
+    "mask": "mask",
+}
+"""Variants beside the sprayed scene, in the order of the paper's columns, as the tables call them."""
+
+DECODINGS = ("dual", "fixed")
+"""Ways to read the same frames, beside the usual one."""
 
 
 def points_table(reference: Measured, results: Sequence[Measured]) -> ReportTable:
     """Write the table as the paper has it: points of each part, and their share of the sprayed part's."""
     by_name = {m.variant.name: m for m in results}
-    columns = [Column("part", "part"), Column("sprayed", "sprayed, points", "d")]
-    for name in SHOWN:
-        title = by_name[name].variant.title
+    columns = [Column("part", "part"), Column("sprayed", "sprayed", "d")]
+    for name, title in SHOWN.items():
         columns += [
-            Column(name, f"{title}, points", "d"),
-            Column(f"{name}_share", "share", ".1%"),
-            Column(f"{name}_truth", "of the truth", ".2%"),
+            Column(name, title, "d"),
+            Column(f"{name}_share", "of sprayed", ".1%"),
+            Column(f"{name}_truth", "of truth", ".2%"),
         ]
     rows = []
     for part in reference.all_parts or by_name["mask"].all_parts:
@@ -36,25 +42,50 @@ def points_table(reference: Measured, results: Sequence[Measured]) -> ReportTabl
 
 
 def detail_table(reference: Measured, everything: Sequence[Measured]) -> ReportTable:
-    """Write every measurement's figures, part by part."""
-    columns = (
+    """Write the figures of every measurement with the usual decoding, part by part."""
+    columns: tuple[Column, ...] = (
         Column("variant", "measurement"),
-        Column("exposure_ms", "exposure, ms", ".1f"),
-        Column("refinements", "refinements", "d"),
+        Column("exposure_ms", "ms", ".0f"),
+        Column("refinements", "rounds", "d"),
         Column("part", "part"),
         Column("points", "good points", "d"),
         Column("of_sprayed", "of sprayed", ".2%"),
-        Column("completeness", "of the truth", ".2%"),
+        Column("completeness", "of truth", ".2%"),
         Column("outlier_share", "outliers", ".3%"),
         Column("over_exposed_share", "over-exposed", ".2%"),
-        Column("mean_mm", "mean distance, mm", ".4f"),
-        Column("std_mm", "standard deviation, mm", ".4f"),
-        Column("rms_mm", "rms, mm", ".4f"),
-        Column("widening_px", "white wider than black stripe, px", ".2f"),
+        Column("mean_mm", "mean mm", ".4f"),
+        Column("std_mm", "std mm", ".4f"),
+        Column("rms_mm", "rms mm", ".4f"),
+        Column("widening_px", "white - black px", "+.2f"),
         Column("error", "error"),
     )
-    rows = [row for measured in everything for row in _detail_rows(measured, reference)]
-    return ReportTable("details", "Every measurement in figures", columns, tuple(rows))
+    usual = [m for m in everything if m.variant.name in ("sprayed", *SHOWN)]
+    rows = [row for measured in usual for row in _detail_rows(measured, reference)]
+    if not any(row["error"] for row in rows):
+        columns = columns[:-1]
+    return ReportTable("measurements", "Every measurement in figures", columns, tuple(rows))
+
+
+def decoding_table(results: Sequence[Measured]) -> ReportTable:
+    """Write what naive and plain dual decoding make of the same frames."""
+    by_name = {m.variant.name: m for m in results}
+    columns = [Column("variant", "frames"), Column("part", "part")]
+    for decoding in ("usual", *DECODINGS):
+        columns += [
+            Column(f"{decoding}_completeness", f"{decoding}, of truth", ".2%"),
+            Column(f"{decoding}_outlier_share", "outliers", ".3%"),
+        ]
+    rows = []
+    for name in SHOWN:
+        names = {"usual": name} | {d: f"{name}_{d}" for d in DECODINGS}
+        for part in by_name[name].all_parts:
+            row: dict[str, Any] = {"variant": name, "part": part}
+            for decoding, variant in names.items():
+                figures = by_name[variant].figures(part) if variant in by_name else {}
+                row[f"{decoding}_completeness"] = figures.get("completeness")
+                row[f"{decoding}_outlier_share"] = figures.get("outlier_share")
+            rows.append(row)
+    return ReportTable("decoding", "Other decoding of the same frames", tuple(columns), tuple(rows))
 
 
 def _detail_rows(measured: Measured, reference: Measured) -> list[dict[str, Any]]:

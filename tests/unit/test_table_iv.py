@@ -5,7 +5,7 @@ import pytest
 
 from backend.numerics.scoring import Score, Scores
 from backend.services.measured import Measured, ratio
-from backend.services.table_iv_tables import detail_table, findings, points_table
+from backend.services.table_iv_tables import decoding_table, detail_table, findings, points_table
 from backend.services.variants import Variant, touched_fields
 
 NAN = float("nan")
@@ -33,6 +33,7 @@ SPRAYED = measured("sprayed", 1.0, 0.8)
 RESULTS = [
     measured("mask", 0.99, 0.8, outliers=0.1),
     measured("no_mask_middle", 0.4, 0.7),
+    measured("mask_fixed", 0.2, 0.3),
     Measured(Variant("no_mask_high", "no mask, high exposure", {}), "The lamp is broken."),
 ]
 
@@ -61,6 +62,14 @@ def test_every_measurement_has_its_rows_and_a_failed_one_its_reason():
     assert shiny["widening_px"] == 0.2
     assert shiny["outlier_share"] == 0.1
     assert shiny["of_sprayed"] == pytest.approx(1.0, abs=2e-3)
+
+
+def test_other_decodings_stand_beside_the_usual_one():
+    rows = {(r["variant"], r["part"]): r for r in decoding_table(RESULTS).rows}
+    black = rows["mask", "black"]
+    assert (black["usual_completeness"], black["fixed_completeness"]) == (0.99, 0.2)
+    assert black["dual_completeness"] is None
+    assert ("no_mask_high", "black") not in rows
 
 
 def test_findings_say_what_the_mask_brought():
