@@ -1,4 +1,4 @@
-"""From an organised cloud to a list of points, in one pass."""
+"""From an organised cloud to a list of points with normals, in one pass."""
 
 from typing import Any, NamedTuple
 
@@ -6,7 +6,10 @@ import numba
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from backend.numerics.kernels import kernel, kernel_input
+from backend.numerics.kernels import kernel, kernel_input, row_loop
+from backend.numerics.lattice import Lattice, lattice_row
+from backend.numerics.normals import new_normal_work, normal_nodes, normal_row
+from backend.numerics.triangulation import Cloud
 
 
 class PointList(NamedTuple):
@@ -14,7 +17,7 @@ class PointList(NamedTuple):
 
     points_mm: Float32[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"]
-    """0 where the organised normal is NaN."""
+    """Unit length, towards the camera; 0 where the neighbourhood is too small, see `normals.normals`."""
     sigma_mm: Float32[np.ndarray, "n"]
     pixel_x: Float32[np.ndarray, "n"]
     pixel_y: Float32[np.ndarray, "n"]
@@ -23,20 +26,23 @@ class PointList(NamedTuple):
 
 
 def gather(
-    points_mm: Float32[np.ndarray, "h w 3"],
-    normals: Float32[np.ndarray, "h w 3"],
-    sigma_mm: Float32[np.ndarray, "h w"],
+    cloud: Cloud,
     exposure_index: UInt8[np.ndarray, "h w"],
     brightness: Float32[np.ndarray, "h w"] | None = None,
+    *,
+    normal_limit: float,
 ) -> PointList:
     """Collect the valid points of an organised cloud with what belongs to them.
 
     Parameters
     ----------
-    points_mm
-        One point per pixel in [mm], NaN where there is none.
-    normals, sigma_mm, exposure_index, brightness
+    cloud
+        One depth per pixel in [mm], NaN where there is none, its noise and the pixels' rays.
+    exposure_index, brightness
         Maps of the same size; brightness may be missing.
+    normal_limit
+        Relative difference of depth, per pixel, up to which neighbours are one surface, see
+        `normals.normal_limit`.
 
     Returns
     -------
@@ -44,11 +50,12 @@ def gather(
 
     Notes
     -----
-    Every map is read once and every list written once: boolean indexing would do so twice per map, on one core.
+    Every map is read once and every list written once; neither the organised coordinates nor the organised
+    normals, three maps each, ever exist.
     """
-    height = points_mm.shape[0]
-    counts = np.empty(height, np.int64)
-    _count(kernel_input(points_mm), counts)
+    depth = kernel_input(cloud.depth_mm)
+    counts = np.empty(depth.shape[0], np.int64)
+    _count(depth, counts)
     starts = np.concatenate([[0], np.cumsum(counts)])
     n = int(starts[-1])
     out = PointList(
@@ -61,60 +68,111 @@ def gather(
         np.empty(n if brightness is not None else 0, np.float32),
     )
     light = np.zeros((1, 1), np.float32) if brightness is None else brightness
-    maps = [kernel_input(m) for m in (points_mm, normals, sigma_mm, exposure_index, light)]
-    _fill(*maps, brightness is not None, starts, *out)  # type: ignore[call-arg]  # two starred lists can't be counted
+    maps = Maps(
+        depth, kernel_input(cloud.sigma_mm), kernel_input(exposure_index), kernel_input(light)
+    )
+    nodes = normal_nodes(cloud.rays)
+    _fill(maps, brightness is not None, nodes, float(normal_limit), starts, out)
     return out
 
 
+class Maps(NamedTuple):
+    """What is gathered."""
+
+    depth: Any  # float32[h, w]
+    sigma: Any  # float32[h, w]
+    exposure: Any  # uint8[h, w]
+    light: Any  # float32[h, w], or [1, 1] without
+
+
 @kernel
-def _count(points: Any, counts: Any) -> None:
+def _count(depth: Any, counts: Any) -> None:
     for row in numba.prange(counts.size):
         number = 0
-        for i in range(points.shape[1]):
-            if not np.isnan(points[row, i, 2]):
-                number += 1
+        for i in range(depth.shape[1]):
+            number += 0 if np.isnan(depth[row, i]) else 1
         counts[row] = number
 
 
+@row_loop
+def _run_end(depth: Any, begin: Any) -> Any:
+    """Return where the points that follow each other from `begin` on end."""
+    end = begin
+    while end < depth.size and depth[end] == depth[end]:  # NaN doesn't equal itself
+        end += 1
+    return end
+
+
+@row_loop
+def _copy(row: Any, out: Any) -> Any:
+    for i in range(out.size):
+        out[i] = row[i]
+
+
+@row_loop
+def _fill_points(z: Any, x: Any, y: Any, out: Any) -> Any:
+    for i in range(z.size):
+        out[i, 0] = z[i] * x[i]
+        out[i, 1] = z[i] * y[i]
+        out[i, 2] = z[i]
+
+
+@row_loop
+def _fill_normals(x: Any, y: Any, z: Any, out: Any) -> Any:
+    for i in range(z.size):
+        known = z[i] == z[i]
+        out[i, 0] = x[i] if known else np.float32(0.0)
+        out[i, 1] = y[i] if known else np.float32(0.0)
+        out[i, 2] = z[i] if known else np.float32(0.0)
+
+
+@row_loop
+def _fill_place(first: Any, row: Any, x: Any, y: Any) -> Any:
+    for i in range(x.size):
+        x[i] = np.float32(first + i)
+        y[i] = np.float32(row)
+
+
+@row_loop
+def _fill_run(
+    maps: Any, with_light: Any, rays: Any, normals: Any, row: Any, i: Any, j: Any, n: Any, out: Any
+) -> Any:
+    """Write the points of pixels i to j of a row, which have no gap, from place n on."""
+    depth, m = maps.depth[row, i:j], n + j - i
+    _fill_points(depth, rays[0, i:j], rays[1, i:j], out.points_mm[n:m])
+    _fill_normals(normals[0, i:j], normals[1, i:j], normals[2, i:j], out.normals[n:m])
+    _fill_place(i, row, out.pixel_x[n:m], out.pixel_y[n:m])
+    _copy(maps.sigma[row, i:j], out.sigma_mm[n:m])
+    _copy(maps.exposure[row, i:j], out.exposure_index[n:m])
+    if with_light:
+        _copy(maps.light[row, i:j], out.brightness[n:m])
+
+
 @kernel
-def _fill(
-    points: Any,
-    normals: Any,
-    sigma: Any,
-    exposure: Any,
-    light: Any,
-    with_light: Any,
-    starts: Any,
-    out_points: Any,
-    out_normals: Any,
-    out_sigma: Any,
-    out_x: Any,
-    out_y: Any,
-    out_exposure: Any,
-    out_light: Any,
-) -> None:
-    for row in numba.prange(points.shape[0]):
+def _fill(maps: Any, with_light: Any, nodes: Any, limit: Any, starts: Any, out: Any) -> None:
+    height, width = maps.depth.shape
+    for row in numba.prange(height):
         n = starts[row]
-        for i in range(points.shape[1]):
-            if np.isnan(points[row, i, 2]):
-                continue
-            for k in range(3):
-                out_points[n, k] = points[row, i, k]
-                normal = normals[row, i, k]
-                out_normals[n, k] = np.float32(0.0) if np.isnan(normal) else normal
-            out_sigma[n] = sigma[row, i]
-            out_x[n] = i
-            out_y[n] = row
-            out_exposure[n] = exposure[row, i]
-            if with_light:
-                out_light[n] = light[row, i]
-            n += 1
+        if starts[row + 1] > n:
+            work = new_normal_work(width, nodes.shape[2])
+            found = np.empty((3, width), np.float32)
+            normal_row(maps.depth, np.int64(row), nodes, limit, work, found)
+            begin = np.int64(0)
+            while begin < width:
+                end = _run_end(maps.depth[row], begin)
+                if end > begin:
+                    _fill_run(maps, with_light, work.rays, found, np.int64(row), begin, end, n, out)
+                    n += end - begin
+                begin = end + 1
 
 
 def warm_up_kernels() -> None:
     """Compile (or load) the kernels on a cloud of one point."""
-    points = np.full((2, 2, 3), np.nan, np.float32)
-    points[0, 0] = 1.0
-    exposure = np.zeros((2, 2), np.uint8)
-    gather(points, points, points[..., 0].copy(), exposure, None)
-    gather(points, points, points[..., 0].copy(), exposure, points[..., 1].copy())
+    depth = np.full((8, 8), np.nan, np.float32)
+    depth[3, 3] = 1.0
+    cloud = Cloud(
+        depth, depth, Lattice(np.stack(np.meshgrid([0.0, 1, 2, 3], [0.0, 1, 2, 3])), 8, 8)
+    )
+    exposure = np.zeros((8, 8), np.uint8)
+    gather(cloud, exposure, normal_limit=0.01)
+    gather(cloud, exposure, depth.copy(), normal_limit=0.01)

@@ -87,6 +87,22 @@ def lattice_row(nodes: Any, y: Any, work: Any, out: Any) -> Any:
         _span(a, c1, c2, c3, begin - first * LATTICE_STEP, out[begin:end])
 
 
+@row_loop
+def lattice_point(nodes: Any, x: Any, y: Any) -> Any:
+    """Interpolate one map at one position, for positions that don't follow a row."""
+    row, v0, v1, v2, v3 = _lagrange(y / LATTICE_STEP, nodes.shape[0])
+    column, w0, w1, w2, w3 = _lagrange(x / LATTICE_STEP, nodes.shape[1])
+    total = 0.0
+    for k, weight in enumerate((v0, v1, v2, v3)):
+        total += weight * (
+            w0 * nodes[row + k, column]
+            + w1 * nodes[row + k, column + 1]
+            + w2 * nodes[row + k, column + 2]
+            + w3 * nodes[row + k, column + 3]
+        )
+    return total
+
+
 @kernel
 def _fill(nodes: Any, out: Any) -> None:
     for y in numba.prange(out.shape[1]):

@@ -46,6 +46,8 @@ class Rectification(NamedTuple):
     reference: Canvas
     other: Canvas
     """Both canvases have the same rows: those that both cameras cover."""
+    rays_of_reference: Lattice
+    """Pixel of the reference camera -> slopes (x/z, y/z) of its ray in that camera's frame."""
     rectified_of_reference: Lattice
     """Pixel of the reference camera -> rectified x, y."""
     pixel_of_reference: Lattice
@@ -103,13 +105,15 @@ def rectify(
     ]
     focal *= _size_factor(focal, borders, (reference, other))
     canvases = _canvases([focal * border for border in borders])
+    seen = ray_lattice(reference)
     return Rectification(
         rectified_from_reference=turn,
         focal_px=focal,
         baseline_mm=baseline_mm,
         reference=canvases[0],
         other=canvases[1],
-        rectified_of_reference=_rectifying(reference, turn, focal),
+        rays_of_reference=seen,
+        rectified_of_reference=_rectifying(seen, turn, focal),
         pixel_of_reference=_unrectifying(reference, turn, focal, canvases[0]),
         pixel_of_other=_unrectifying(other, turn_other, focal, canvases[1]),
         other_size_px=(other.width_px, other.height_px),
@@ -181,11 +185,10 @@ def _canvases(borders_px: list[Float[np.ndarray, "_n 2"]]) -> tuple[Canvas, Canv
     return first, second
 
 
-def _rectifying(camera: Pinhole, turn: Float[np.ndarray, "3 3"], focal_px: float) -> Lattice:
-    lattice = ray_lattice(camera)
-    x, y = lattice.nodes
+def _rectifying(seen: Lattice, turn: Float[np.ndarray, "3 3"], focal_px: float) -> Lattice:
+    x, y = seen.nodes
     turned = np.tensordot(turn, np.stack([x, y, np.ones_like(x)]), axes=1)
-    return lattice._replace(nodes=np.ascontiguousarray(focal_px * turned[:2] / turned[2]))
+    return seen._replace(nodes=np.ascontiguousarray(focal_px * turned[:2] / turned[2]))
 
 
 def _unrectifying(

@@ -15,17 +15,30 @@ from backend.numerics.camera_model import (
 )
 from backend.numerics.errors import CalibrationError
 from backend.numerics.kernels import kernel, kernel_input, row_loop
-from backend.numerics.lattice import lattice_row
+from backend.numerics.lattice import Lattice, lattice_row
 from backend.numerics.matching import Matches
 from backend.numerics.rectification import Rectification
 
 
 class Cloud(NamedTuple):
-    """One point per pixel of the reference camera, in that camera's frame; NaN where there is none."""
+    """One point per pixel of the reference camera, in that camera's frame; NaN where there is none.
 
-    points_mm: Float32[np.ndarray, "h w 3"]
+    Points lie on their pixels' rays, so that the depth says it all: a third of the memory of coordinates.
+    """
+
+    depth_mm: Float32[np.ndarray, "h w"]
+    """z of the point."""
     sigma_mm: Float32[np.ndarray, "h w"]
     """Standard deviation of the point along its pixel's ray; NaN if the coordinate's noise isn't known."""
+    rays: Lattice
+    """Slopes (x/z, y/z) of the pixels' rays."""
+
+    @property
+    def points_mm(self) -> Float32[np.ndarray, "h w 3"]:
+        """Coordinates of the points, made anew at each call."""
+        points_mm = np.empty((*self.depth_mm.shape, 3), np.float32)
+        _point_rows(self.depth_mm, self.rays.nodes, points_mm)
+        return points_mm
 
 
 _NEWTON_STEPS = 3
@@ -44,8 +57,8 @@ def triangulate_pair(matches: Matches, rectification: Rectification) -> Cloud:
 
     Returns
     -------
-    Points in [mm] in the reference camera's frame, exactly on their pixels' rays, and their standard
-    deviation along the ray in [mm], float32. Points behind the camera are NaN.
+    Depths in [mm] in the reference camera's frame and the points' standard deviation along their
+    pixels' rays in [mm], float32. Points behind the camera are NaN.
 
     Notes
     -----
@@ -53,18 +66,22 @@ def triangulate_pair(matches: Matches, rectification: Rectification) -> Cloud:
 
     in the rectified frame, turned back into the camera's. Coefficients are float64, results float32.
     """
-    height, width = matches.x_other_px.shape
-    cloud = Cloud(np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32))
+    cloud = _empty_cloud(matches.x_other_px.shape, rectification.rays_of_reference)
     _pair_rows(
         matches.x_other_px,
         matches.sigma_disparity_px,
         rectification.rectified_of_reference.nodes,
-        np.ascontiguousarray(rectification.rectified_from_reference.T),
+        np.ascontiguousarray(rectification.rectified_from_reference[:, 2]),
         rectification.focal_px,
         rectification.baseline_mm,
-        *cloud,
+        cloud.depth_mm,
+        cloud.sigma_mm,
     )
     return cloud
+
+
+def _empty_cloud(shape: tuple[int, ...], rays: Lattice) -> Cloud:
+    return Cloud(np.empty(shape, np.float32), np.empty(shape, np.float32), rays)
 
 
 def triangulate_projector(
@@ -93,7 +110,7 @@ def triangulate_projector(
 
     Returns
     -------
-    Points in [mm] in the camera's frame and their standard deviation along the ray in [mm],
+    Depths in [mm] in the camera's frame and the points' standard deviation along the ray in [mm],
     float32. NaN where the ray runs along the plane or meets it behind the camera or projector.
 
     Raises
@@ -111,23 +128,16 @@ def triangulate_projector(
     Newton steps on the distorted projection, which for a real lens leaves less than 1e-6 px.
     sigma is :math:`\sigma_u |\partial \lambda / \partial u| |r|`.
     """
-    _check_projector_input(projector_px, camera, projector, projector_from_camera)
-    lattice = ray_lattice(camera)
-    cloud = Cloud(
-        np.empty((*projector_px.shape, 3), np.float32), np.empty(projector_px.shape, np.float32)
-    )
-    coefficients = _coefficients(projector, rows=rows)
+    _check_size(projector_px, camera)
+    cloud = _empty_cloud(projector_px.shape, ray_lattice(camera))
     unknown = np.full((1, projector_px.shape[1]), np.nan, np.float32)
     _plane_rows(
         kernel_input(projector_px),
         unknown if sigma_projector_px is None else kernel_input(sigma_projector_px),
-        lattice.nodes,
-        _plane_coefficients(coefficients, projector_from_camera),
-        projector_from_camera.R.astype(np.float64),
-        projector_from_camera.t_mm.astype(np.float64),
-        coefficients,
-        bool(np.any(projector.distortion)),
-        *cloud,
+        cloud.rays.nodes,
+        projector_planes(projector, projector_from_camera, rows=rows),
+        cloud.depth_mm,
+        cloud.sigma_mm,
     )
     return cloud
 
@@ -167,28 +177,69 @@ def projector_consistency(
     CalibrationError
         If the model or the pose can't be used.
     """
-    check_pinhole(projector, "the projector")
-    check_transform(projector_from_points, "the projector")
     out = np.empty(projector_px.shape, np.float32)
     _residual_rows(
         kernel_input(points_mm),
         kernel_input(projector_px),
-        projector_from_points.R.astype(np.float64),
-        projector_from_points.t_mm.astype(np.float64),
-        _coefficients(projector, rows=rows),
+        projector_planes(projector, projector_from_points, rows=rows),
         out,
     )
     return out
 
 
-def _check_projector_input(
+def depth_consistency(
+    cloud: Cloud,
     projector_px: Float32[np.ndarray, "h w"],
-    camera: Pinhole,
     projector: Pinhole,
     projector_from_camera: RigidTransform,
-) -> None:
+    *,
+    rows: bool = False,
+) -> Float32[np.ndarray, "h w"]:
+    """Return what `projector_consistency` does, of points that are given by their depths."""
+    out = np.empty(projector_px.shape, np.float32)
+    _depth_residual_rows(
+        cloud.depth_mm,
+        cloud.rays.nodes,
+        kernel_input(projector_px),
+        projector_planes(projector, projector_from_camera, rows=rows),
+        out,
+    )
+    return out
+
+
+class ProjectorPlanes(NamedTuple):
+    """The projector's columns (or rows) as kernels take them; `projector_planes` makes it."""
+
+    plane: Any  # float64[2, 4]: rows of K [R | t] that give u times distance, and the distance
+    R: Any  # float64[3, 3]
+    t_mm: Any  # float64[3]
+    lens: Any  # float64[15]: see `_coefficients`
+    curved: bool  # the lens distorts
+
+
+def projector_planes(
+    projector: Pinhole, projector_from_points: RigidTransform, *, rows: bool = False
+) -> ProjectorPlanes:
+    """Prepare a projector for `plane_depths`.
+
+    Raises
+    ------
+    CalibrationError
+        If the model or the pose can't be used.
+    """
     check_pinhole(projector, "the projector")
-    check_transform(projector_from_camera, "the projector")
+    check_transform(projector_from_points, "the projector")
+    coefficients = _coefficients(projector, rows=rows)
+    return ProjectorPlanes(
+        _plane_coefficients(coefficients, projector_from_points),
+        projector_from_points.R.astype(np.float64),
+        projector_from_points.t_mm.astype(np.float64),
+        coefficients,
+        bool(np.any(projector.distortion)),
+    )
+
+
+def _check_size(projector_px: Float32[np.ndarray, "h w"], camera: Pinhole) -> None:
     if projector_px.shape != (camera.height_px, camera.width_px):
         raise CalibrationError(
             f"the map is {projector_px.shape[1]}x{projector_px.shape[0]} px but the camera's calibration"
@@ -236,14 +287,11 @@ def _pair_depth(
 
 
 @row_loop
-def _turned(x: Any, y: Any, depth: Any, turn: Any, scale: Any, points: Any) -> Any:
-    t00, t01, t02 = turn[0, 0] * scale, turn[0, 1] * scale, turn[0, 2]
-    t10, t11, t12 = turn[1, 0] * scale, turn[1, 1] * scale, turn[1, 2]
-    t20, t21, t22 = turn[2, 0] * scale, turn[2, 1] * scale, turn[2, 2]
+def _depth_along_axis(x: Any, y: Any, depth: Any, axis: Any, scale: Any, out: Any) -> Any:
+    """Turn depths in the rectified frame into those along the camera's own axis."""
+    a0, a1, a2 = axis[0] * scale, axis[1] * scale, axis[2]
     for i in range(x.size):
-        points[i, 0] = depth[i] * (t00 * x[i] + t01 * y[i] + t02)
-        points[i, 1] = depth[i] * (t10 * x[i] + t11 * y[i] + t12)
-        points[i, 2] = depth[i] * (t20 * x[i] + t21 * y[i] + t22)
+        out[i] = depth[i] * (a0 * x[i] + a1 * y[i] + a2)
 
 
 @kernel
@@ -251,22 +299,40 @@ def _pair_rows(
     x_other: Any,
     sigma_d: Any,
     nodes: Any,
-    turn: Any,
+    axis: Any,
     focal: Any,
     baseline: Any,
-    points: Any,
+    out: Any,
     sigma: Any,
 ) -> None:
     height, width = x_other.shape
     for row in numba.prange(height):
-        x = np.empty(width, np.float64)
-        y = np.empty(width, np.float64)
-        depth = np.empty(width, np.float64)
+        rows = np.empty((3, width), np.float64)
+        x, y, depth = rows[0], rows[1], rows[2]
         work = np.empty(nodes.shape[2], np.float64)
         lattice_row(nodes[0], row, work, x)
         lattice_row(nodes[1], row, work, y)
         _pair_depth(x, y, x_other[row], sigma_d[row], focal, focal * baseline, depth, sigma[row])
-        _turned(x, y, depth, turn, 1.0 / focal, points[row])
+        _depth_along_axis(x, y, depth, axis, 1.0 / focal, out[row])
+
+
+@row_loop
+def _on_rays(x: Any, y: Any, depth: Any, points: Any) -> Any:
+    for i in range(x.size):
+        points[i, 0] = depth[i] * x[i]
+        points[i, 1] = depth[i] * y[i]
+        points[i, 2] = depth[i]
+
+
+@kernel
+def _point_rows(depth: Any, nodes: Any, points: Any) -> None:
+    height, width = depth.shape
+    for row in numba.prange(height):
+        rays = np.empty((2, width), np.float64)
+        work = np.empty(nodes.shape[2], np.float64)
+        lattice_row(nodes[0], row, work, rays[0])
+        lattice_row(nodes[1], row, work, rays[1])
+        _on_rays(rays[0], rays[1], depth[row], points[row])
 
 
 @row_loop
@@ -343,15 +409,17 @@ def _newton(x: Any, y: Any, u: Any, R: Any, t: Any, c: Any, depth: Any, per_px: 
 
 
 @row_loop
-def _on_rays(x: Any, y: Any, depth: Any, points: Any) -> Any:
-    for i in range(x.size):
-        points[i, 0] = depth[i] * x[i]
-        points[i, 1] = depth[i] * y[i]
-        points[i, 2] = depth[i]
+def plane_depths(x: Any, y: Any, u: Any, planes: Any, depth: Any, per_px: Any) -> Any:
+    """Intersect rays with their planes: depth, and its change per px of the coordinate."""
+    _plane_depth(x, y, u, planes.plane, depth, per_px)
+    if planes.curved:
+        for _ in range(_NEWTON_STEPS):
+            _newton(x, y, u, planes.R, planes.t_mm, planes.lens, depth, per_px)
 
 
 @row_loop
-def _along_ray(x: Any, y: Any, depth: Any, per_px: Any, sigma_px: Any, sigma: Any) -> Any:
+def along_ray(x: Any, y: Any, depth: Any, per_px: Any, sigma_px: Any, sigma: Any) -> Any:
+    """Turn the coordinate's noise into that of the point along its ray."""
     for i in range(x.size):
         length = np.sqrt(x[i] * x[i] + y[i] * y[i] + 1.0)
         sigma[i] = sigma_px[i] * abs(per_px[i]) * length if depth[i] > 0.0 else np.nan
@@ -359,54 +427,69 @@ def _along_ray(x: Any, y: Any, depth: Any, per_px: Any, sigma_px: Any, sigma: An
 
 @kernel
 def _plane_rows(
-    projector_px: Any,
-    sigma_px: Any,
-    nodes: Any,
-    n: Any,
-    R: Any,
-    t: Any,
-    c: Any,
-    curved: Any,
-    points: Any,
-    sigma: Any,
+    projector_px: Any, sigma_px: Any, nodes: Any, planes: Any, out: Any, sigma: Any
 ) -> None:
     height, width = projector_px.shape
     known = np.int64(1 if sigma_px.shape[0] == height else 0)
     for row in numba.prange(height):
-        x = np.empty(width, np.float64)
-        y = np.empty(width, np.float64)
-        depth = np.empty(width, np.float64)
-        per_px = np.empty(width, np.float64)
+        rows = np.empty((4, width), np.float64)
+        x, y, depth, per_px = rows[0], rows[1], rows[2], rows[3]
         work = np.empty(nodes.shape[2], np.float64)
         lattice_row(nodes[0], row, work, x)
         lattice_row(nodes[1], row, work, y)
-        u = projector_px[row]
-        _plane_depth(x, y, u, n, depth, per_px)
-        if curved:
-            for _ in range(_NEWTON_STEPS):
-                _newton(x, y, u, R, t, c, depth, per_px)
-        _on_rays(x, y, depth, points[row])
-        _along_ray(x, y, depth, per_px, sigma_px[np.int64(row) * known], sigma[row])
+        plane_depths(x, y, projector_px[row], planes, depth, per_px)
+        out[row] = depth
+        along_ray(x, y, depth, per_px, sigma_px[np.int64(row) * known], sigma[row])
 
 
 @row_loop
-def _residual_row(points: Any, u: Any, R: Any, t: Any, c: Any, out: Any) -> Any:
+def _residual_row(X: Any, Y: Any, Z: Any, u: Any, R: Any, t: Any, c: Any, out: Any) -> Any:
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
     t0, t1, t2 = t[0], t[1], t[2]
     lens = _scalars(c)
     for i in range(u.size):
-        X, Y, Z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        distance = r20 * X + r21 * Y + r22 * Z + t2
+        distance = r20 * X[i] + r21 * Y[i] + r22 * Z[i] + t2
         scale = 1.0 / distance
-        px = (r00 * X + r01 * Y + r02 * Z + t0) * scale
-        py = (r10 * X + r11 * Y + r12 * Z + t1) * scale
+        px = (r00 * X[i] + r01 * Y[i] + r02 * Z[i] + t0) * scale
+        py = (r10 * X[i] + r11 * Y[i] + r12 * Z[i] + t1) * scale
         value, _, _ = _bent(px, py, lens)
         out[i] = value - u[i] if distance > 0.0 else np.nan
 
 
+@row_loop
+def _split(points: Any, X: Any, Y: Any, Z: Any) -> Any:
+    for i in range(X.size):
+        X[i], Y[i], Z[i] = points[i, 0], points[i, 1], points[i, 2]
+
+
 @kernel
-def _residual_rows(points: Any, u: Any, R: Any, t: Any, c: Any, out: Any) -> None:
+def _residual_rows(points: Any, u: Any, planes: Any, out: Any) -> None:
     for row in numba.prange(u.shape[0]):
-        _residual_row(points[row], u[row], R, t, c, out[row])
+        rows = np.empty((3, u.shape[1]), np.float64)
+        _split(points[row], rows[0], rows[1], rows[2])
+        _residual_row(
+            rows[0], rows[1], rows[2], u[row], planes.R, planes.t_mm, planes.lens, out[row]
+        )
+
+
+@row_loop
+def _scale_rays(x: Any, y: Any, depth: Any, Z: Any) -> Any:
+    for i in range(x.size):
+        Z[i] = depth[i]
+        x[i] *= Z[i]
+        y[i] *= Z[i]
+
+
+@kernel
+def _depth_residual_rows(depth: Any, nodes: Any, u: Any, planes: Any, out: Any) -> None:
+    for row in numba.prange(u.shape[0]):
+        rows = np.empty((3, u.shape[1]), np.float64)
+        work = np.empty(nodes.shape[2], np.float64)
+        lattice_row(nodes[0], row, work, rows[0])
+        lattice_row(nodes[1], row, work, rows[1])
+        _scale_rays(rows[0], rows[1], depth[row], rows[2])
+        _residual_row(
+            rows[0], rows[1], rows[2], u[row], planes.R, planes.t_mm, planes.lens, out[row]
+        )

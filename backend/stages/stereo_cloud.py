@@ -15,19 +15,19 @@ from backend.domain.stage import stage
 from backend.domain.states import Review
 from backend.numerics import filters
 from backend.numerics.camera_model import Pinhole, RigidTransform
-from backend.numerics.confirmation import confirmed
-from backend.numerics.drift import smooth_drift
+from backend.numerics.confirmation import settle
+from backend.numerics.drift import take_off_drift
 from backend.numerics.filters import Kept
 from backend.numerics.gathering import gather
 from backend.numerics.matching import MatchSettings, match
-from backend.numerics.normals import normals
+from backend.numerics.normals import normal_limit
 from backend.numerics.reasons import Reason
-from backend.numerics.rectification import rectify
+from backend.numerics.rectification import Rectification, rectify
 from backend.numerics.triangulation import (
     Cloud as OrganisedCloud,
 )
 from backend.numerics.triangulation import (
-    projector_consistency,
+    depth_consistency,
     triangulate_pair,
     triangulate_projector,
 )
@@ -110,7 +110,7 @@ class StereoCloudParams(Params):
     """x, y, z from, then to, in the reference camera's frame; empty: everything."""
 
 
-@stage(title="Cloud", version=1, review=Review.ALWAYS, checks=(enough_points, precise_enough))
+@stage(title="Cloud", version=2, review=Review.ALWAYS, checks=(enough_points, precise_enough))
 def stereo_cloud(
     phase: AbsolutePhase,
     calibration: RigCalibration,
@@ -133,11 +133,15 @@ def stereo_cloud(
 class _Raw:
     """The organised cloud while filters work on it."""
 
-    points_mm: Float32[np.ndarray, "h w 3"]
-    sigma_mm: Float32[np.ndarray, "h w"]
+    points: OrganisedCloud
     reasons: UInt16[np.ndarray, "h w"]
     consistency_px: float = float("nan")
     """Contradiction with the projector that was allowed; NaN if it wasn't checked."""
+
+    @property
+    def depth_mm(self) -> Float32[np.ndarray, "h w"]:
+        """Depth of each pixel's point; NaN where there is none."""
+        return self.points.depth_mm
 
 
 _Filter = Callable[[_Raw], Kept]
@@ -209,27 +213,20 @@ class _Scene:
             sigma_other_px=self.phase.sigma_px[self.other],
             settings=MatchSettings(self.params.jump_px, self.params.agreement_px),
         )
-        cloud = triangulate_pair(matches, rectification)
-        raw = _Raw(cloud.points_mm, cloud.sigma_mm, self.phase.reasons[self.name] | matches.reasons)
+        points = triangulate_pair(matches, rectification)
+        raw = _Raw(points, self.phase.reasons[self.name] | matches.reasons)
         if self.params.settle_by_projector:
-            self._settle(raw, other, pose)
+            self._settle(raw, rectification)
         return raw
 
     def from_projector(self) -> _Raw:
         """Intersect the reference camera's rays with the planes of the projector's columns (or rows)."""
         rows = self.name not in self.phase.projector_px
-        cloud = self._projector_cloud(rows)
-        reasons = self.phase.reasons[self.name].copy()
-        missing = (reasons == 0) & ~filters.valid_points(cloud.points_mm)
-        reasons[missing] |= np.uint16(Reason.NO_MATCH)
-        return _Raw(cloud.points_mm, cloud.sigma_mm, reasons)
-
-    def _projector_cloud(self, rows: bool) -> OrganisedCloud:
         assert self.projector is not None
         assert self.projector_from_camera is not None
         maps = self.phase.projector_row_px if rows else self.phase.projector_px
         sigma = self.phase.sigma_row_px if rows else self.phase.sigma_px
-        return triangulate_projector(
+        points = triangulate_projector(
             maps[self.name],
             self.camera,
             self.projector,
@@ -237,29 +234,25 @@ class _Scene:
             sigma_projector_px=sigma[self.name],
             rows=rows,
         )
+        reasons = self.phase.reasons[self.name].copy()
+        missing = (reasons == 0) & ~filters.valid_points(points.depth_mm)
+        reasons[missing] |= np.uint16(Reason.NO_MATCH)
+        return _Raw(points, reasons)
 
-    def _settle(self, raw: _Raw, other: Pinhole, other_from_camera: RigidTransform) -> None:
+    def _settle(self, raw: _Raw, rectification: Rectification) -> None:
         """Take the projector's word for pixels without a clear partner, where the other camera confirms it."""
-        if self.projector is None or self.other is None:
+        if self.projector is None or self.projector_from_camera is None or self.other is None:
             return
-        coordinate = self.phase.projector_px[self.name]
-        doubtful = np.isfinite(coordinate) & ~filters.valid_points(raw.points_mm)
-        single = self._projector_cloud(rows=False)
-        doubtful &= filters.valid_points(single.points_mm)
-        y, x = np.nonzero(doubtful)
-        sigma_px = self.phase.sigma_px[self.name][y, x] * np.float32(1.5)
-        agreed = confirmed(
-            single.points_mm[y, x],
-            coordinate[y, x],
+        settle(
+            raw.points,
+            raw.reasons,
+            self.phase.projector_px[self.name],
+            self.phase.sigma_px[self.name],
             self.phase.projector_px[self.other],
-            other,
-            other_from_camera,
-            sigma_px=sigma_px,
+            rectification,
+            self.projector,
+            self.projector_from_camera,
         )
-        y, x = y[agreed], x[agreed]
-        raw.points_mm[y, x] = single.points_mm[y, x]
-        raw.sigma_mm[y, x] = single.sigma_mm[y, x]
-        raw.reasons[y, x] = 0
 
     def filters(self, raw: _Raw) -> list[tuple[str, Reason, _Filter]]:
         """List the filters that are switched on, in the order of their application."""
@@ -276,7 +269,7 @@ class _Scene:
                 (
                     "too uncertain",
                     Reason.OUTLIER,
-                    lambda r: filters.within_limits(r.points_mm, r.sigma_mm, highest=limit),
+                    lambda r: filters.within_limits(r.depth_mm, r.points.sigma_mm, highest=limit),
                 )
             )
         if p.box_mm is not None:
@@ -285,7 +278,7 @@ class _Scene:
                 (
                     "outside the box",
                     Reason.CLIPPED,
-                    lambda r: filters.within_box(r.points_mm, box[:3], box[3:]),
+                    lambda r: filters.within_box(r.depth_mm, r.points.rays, box[:3], box[3:]),
                 )
             )
         if p.outlier_sigmas > 0:
@@ -294,8 +287,8 @@ class _Scene:
                     "outliers",
                     Reason.OUTLIER,
                     lambda r: filters.without_outliers(
-                        r.points_mm,
-                        sigma_mm=r.sigma_mm,
+                        r.depth_mm,
+                        sigma_mm=r.points.sigma_mm,
                         pixel_angle_rad=angle,
                         factor=p.outlier_sigmas,
                     ),
@@ -308,7 +301,7 @@ class _Scene:
                     "specks",
                     Reason.OUTLIER,
                     lambda r: filters.without_specks(
-                        r.points_mm, least_pixels=least_pixels, pixel_angle_rad=angle
+                        r.depth_mm, least_pixels=least_pixels, pixel_angle_rad=angle
                     ),
                 )
             )
@@ -337,7 +330,7 @@ class _Scene:
 
     def _undisputed(self, raw: _Raw) -> Kept:
         residual = self.phase.residual_cycles[self.name]
-        return filters.within_limits(raw.points_mm, residual, highest=self.residual_max_cycles)
+        return filters.within_limits(raw.depth_mm, residual, highest=self.residual_max_cycles)
 
     def _consistent(self, raw: _Raw) -> Kept:
         assert self.projector is not None
@@ -345,20 +338,25 @@ class _Scene:
         rows = self.other is None
         maps = self.phase.projector_row_px if rows else self.phase.projector_px
         sigma = (self.phase.sigma_row_px if rows else self.phase.sigma_px)[self.name]
-        contradiction = projector_consistency(
-            raw.points_mm, maps[self.name], self.projector, self.projector_from_camera, rows=rows
+        contradiction = depth_consistency(
+            raw.points, maps[self.name], self.projector, self.projector_from_camera, rows=rows
         )
-        contradiction -= smooth_drift(contradiction)
-        size = np.abs(contradiction)
-        raw.consistency_px = self.params.consistency_px or _usual_spread(size)
-        beyond_noise = size - np.float32(NOISE_SIGMAS) * np.nan_to_num(sigma)
-        return filters.within_limits(raw.points_mm, beyond_noise, highest=raw.consistency_px)
+        take_off_drift(contradiction)
+        limit_px = raw.consistency_px = self.params.consistency_px or _usual_spread(contradiction)
+        return filters.within_limits(
+            raw.depth_mm,
+            contradiction,
+            lowest=-limit_px,
+            highest=limit_px,
+            sigma=sigma,
+            sigmas=NOISE_SIGMAS,
+        )
 
     def apply(self, title: str, reason: Reason, keep: _Filter, raw: _Raw) -> FilterRow:
         """Apply one filter: remove its points and note why."""
         kept = keep(raw)
         if kept.removed:
-            raw.reasons[filters.remove(raw.points_mm, kept)] |= np.uint16(reason)
+            raw.reasons[filters.remove(raw.depth_mm, kept)] |= np.uint16(reason)
         return FilterRow(title, kept.removed)
 
     def cloud(
@@ -366,11 +364,10 @@ class _Scene:
     ) -> Cloud:
         """Gather the points that are left."""
         points = gather(
-            raw.points_mm,
-            normals(raw.points_mm, self.camera),
-            raw.sigma_mm,
+            raw.points,
             self.phase.exposure_index[self.name],
             brightness,
+            normal_limit=normal_limit(self.camera),
         )
         count = len(points.points_mm)
         if count == 0:
@@ -386,7 +383,7 @@ class _Scene:
             pixel_x=points.pixel_x,
             pixel_y=points.pixel_y,
             exposure_index=points.exposure_index,
-            depth_mm={self.name: np.ascontiguousarray(raw.points_mm[..., 2])},
+            depth_mm={self.name: raw.depth_mm},
             reasons={self.name: raw.reasons},
             removed=rows,
             point_count=count,
@@ -400,6 +397,7 @@ class _Scene:
 
 
 def _usual_spread(contradiction_px: Float32[np.ndarray, "h w"]) -> float:
-    known = contradiction_px[np.isfinite(contradiction_px)][::11]
+    some = contradiction_px.ravel()[::11]
+    known = np.abs(some[np.isfinite(some)])
     spread_px = 1.4826 * float(np.median(known)) if known.size else 0.0
     return max(SPREADS * spread_px, LEAST_SPREAD_PX)

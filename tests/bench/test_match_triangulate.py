@@ -159,14 +159,14 @@ def test_coordinates_to_cloud(scene: dict[str, Any]) -> None:
             scene["left"], scene["right"], pair, sigma_reference_px=sigma, sigma_other_px=sigma
         )
         cloud = triangulate_pair(matches, pair)
-        points = cloud.points_mm
+        points = cloud.depth_mm
         for kept in (
             within_limits(points, cloud.sigma_mm, highest=1.0),
             without_outliers(points, sigma_mm=cloud.sigma_mm, pixel_angle_rad=angle),
             without_specks(points, least_pixels=50, pixel_angle_rad=angle),
         ):
             remove(points, kept)
-        return int(np.isfinite(normals(points, device)[..., 0]).sum())
+        return int(np.isfinite(normals(cloud.points_mm, device)[..., 0]).sum())
 
     part = slice(pair.reference.height_px // 2, pair.reference.height_px // 2 + HEIGHT // 8)
     copy, whole, plain_match = best_ms(
