@@ -21,13 +21,21 @@ from backend.contract.requests import (
     Decide,
     EditSettings,
     ExportScan,
+    GivenSource,
     ImportCapture,
     RedoStage,
     StartRun,
     UndoEdit,
 )
 from backend.contract.rigs import RigOffer, RigView
-from backend.contract.scans import AuditEntry, ScanState, ScanSummary
+from backend.contract.scans import (
+    ArtifactRef,
+    AuditEntry,
+    CalibrationView,
+    PixelLevels,
+    ScanState,
+    ScanSummary,
+)
 
 Array = NDArray[Any]
 T = TypeVar("T")
@@ -39,6 +47,10 @@ _SCANS: TypeAdapter[tuple[ScanSummary, ...]] = TypeAdapter(tuple[ScanSummary, ..
 _SCAN = TypeAdapter(ScanState)
 _AUDIT: TypeAdapter[tuple[AuditEntry, ...]] = TypeAdapter(tuple[AuditEntry, ...])
 _PATHS: TypeAdapter[tuple[str, ...]] = TypeAdapter(tuple[str, ...])
+_LEVELS = TypeAdapter(PixelLevels)
+_REFERENCE = TypeAdapter(ArtifactRef)
+_CALIBRATION = TypeAdapter(CalibrationView)
+_CALIBRATIONS: TypeAdapter[tuple[CalibrationView, ...]] = TypeAdapter(tuple[CalibrationView, ...])
 _DOCUMENT: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 
 _RETRY_S = 1.0
@@ -175,6 +187,25 @@ class ApiClient:
         """Return who did what and when."""
         return self._get(f"/api/scans/{quote(scan_id)}/audit", _AUDIT)
 
+    def keep(self, stage_run: str) -> CalibrationView:
+        """Keep a result for its rig."""
+        path = f"/api/stage-runs/{quote(stage_run)}/calibration"
+        return self._send("POST", path, None, _CALIBRATION)
+
+    def calibrations(self, rig: str) -> tuple[CalibrationView, ...]:
+        """Return what was ever kept for a rig, newest first."""
+        return self._get(f"/api/rigs/{quote(rig)}/calibrations", _CALIBRATIONS)
+
+    def give(self, scan_id: str, type_name: str, source: GivenSource) -> ScanState:
+        """Hand a result to a scan."""
+        path = f"/api/scans/{quote(scan_id)}/given/{quote(type_name)}"
+        return self._send("PUT", path, source, _SCAN)
+
+    def take_away(self, scan_id: str, type_name: str) -> ScanState:
+        """Take a handed-over result away."""
+        path = f"/api/scans/{quote(scan_id)}/given/{quote(type_name)}"
+        return self._send("DELETE", path, None, _SCAN)
+
     def export(self, scan_id: str, request: ExportScan) -> tuple[str, ...]:
         """Write the results into a folder of the server; return what was written."""
         path = f"/api/scans/{quote(scan_id)}/export"
@@ -199,6 +230,20 @@ class ApiClient:
         """Return one pixel of a map."""
         query = {"x": x, "y": y}
         return self._get(f"/api/artifacts/{quote(artifact)}/at", _DOCUMENT, query).get("value")
+
+    def levels_at(
+        self, scan_id: str, stage: str, field: str, *, camera: str, x: int, y: int
+    ) -> PixelLevels:
+        """Return the gray levels of one pixel in all frames of a camera."""
+        path = f"/api/scans/{quote(scan_id)}/stages/{quote(stage)}/fields/{quote(field)}/at"
+        return self._get(path, _LEVELS, {"camera": camera, "x": x, "y": y})
+
+    def upload_mask(self, factors: Array) -> ArtifactRef:
+        """Keep a painted mask, float32 in [0, 1] or NaN, so that a setting can name it."""
+        file = io.BytesIO()
+        np.save(file, factors)
+        answer = self._http.post("/api/artifacts", content=file.getvalue())
+        return _REFERENCE.validate_json(_checked(answer).content)
 
     def points(self, stage_run: str, field: str, *, budget: int) -> PointsPreview:
         """Return a cloud with all its scalars, thinned to at most `budget` points."""

@@ -75,6 +75,15 @@ class Desk(Protocol):
     def export(self) -> None:
         """Ask where to write the results."""
 
+    def keep(self) -> None:
+        """Keep the result on the screen for its rig."""
+
+    def take_away(self, type_name: str) -> None:
+        """Take a handed-over result from the scan."""
+
+    def choose_calibration(self, type_name: str) -> None:
+        """Ask which result to hand to the scan."""
+
     def inspect(self, camera: str) -> None:
         """Show a camera's picture large, and answer questions about pixels."""
 

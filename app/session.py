@@ -23,9 +23,10 @@ from app.panels.audit import AuditPanel
 from app.panels.cloud import CloudPanel
 from app.panels.decision import buttons
 from app.panels.dialogs import ask_export, ask_part_moved
-from app.panels.inspect import Inspector, decoded, decoded_url, pixel_of
+from app.panels.handed import HandedPanel, ask_calibration
+from app.panels.inspect import Inspector
 from app.panels.new_scan import NewScanPanel
-from app.panels.pictures import PicturesPanel, is_live
+from app.panels.pictures import Choice, PicturesPanel, is_live
 from app.panels.review import ReviewPanel
 from app.panels.rig import RigPanel
 from app.panels.scan_list import ScanListPanel
@@ -34,6 +35,8 @@ from app.panels.stage import StagePanel
 from app.space import Space
 from app.station import Introduction
 from app.views.mask import crisp
+from app.views.picture import Figure
+from app.views.pixel import decoded, decoded_url, pixel_of
 from app.worker import Work, Worker
 from backend.contract.descriptions import MethodDescription
 from backend.contract.events import Event, FrameCaptured, JobProgress, RigChanged, ScanChanged
@@ -42,6 +45,7 @@ from backend.contract.requests import (
     Decide,
     EditSettings,
     ExportScan,
+    GivenSource,
     ImportCapture,
     RedoStage,
     StartRun,
@@ -187,6 +191,18 @@ class Session:
         """Ask where to write the results."""
         self.act(self._ask_export)
 
+    def keep(self) -> None:
+        """Keep the result on the screen for its rig."""
+        self.act(self._keep)
+
+    def take_away(self, type_name: str) -> None:
+        """Take a handed-over result from the scan."""
+        self.act(lambda: self._take_away(type_name))
+
+    def choose_calibration(self, type_name: str) -> None:
+        """Ask which result to hand to the scan."""
+        self.act(lambda: self._ask_calibration(type_name))
+
     def create(self, request: CreateScan, *, run: bool) -> None:
         """Make a scan, open it, and run it if asked to."""
         self.act(lambda: self._patiently("Opening the rig", lambda: self._create(request, run=run)))
@@ -263,6 +279,7 @@ class Session:
             self._audit = AuditPanel(gui)
         with self._scan:
             self._stage = StagePanel(gui, self)
+            self._handed = HandedPanel(gui, self)
             self._review = ReviewPanel(gui, self)
             self._settings = SettingsPanel(gui, self) if self.who.may_operate else None
 
@@ -454,6 +471,35 @@ class Session:
         if look is not None and look.scan.undo and look.may_operate:
             self._take(self.api.undo(look.scan.id, UndoEdit(revision=look.scan.revision)))
 
+    def _keep(self) -> None:
+        look = self._look
+        if look is None or not look.may_operate or not look.stage.stage_run:
+            return
+        kept = self.api.keep(look.stage.stage_run)
+        self.notify(
+            f"Calibration {kept.number}",
+            f"{kept.title}: later scans with this rig get it.",
+            colour="green",
+        )
+        self._take(self.api.scan(look.scan.id))
+
+    def _take_away(self, type_name: str) -> None:
+        look = self._look
+        if look is not None and look.may_operate:
+            self._take(self.api.take_away(look.scan.id, type_name))
+
+    def _ask_calibration(self, type_name: str) -> None:
+        look = self._look
+        if look is None or not look.may_operate:
+            return
+        kept = self.api.calibrations(look.scan.rig) if look.scan.rig else ()
+        offered = [c for c in kept if c.type == type_name and c.withdrawn is None]
+
+        def give(source: GivenSource) -> None:
+            self.act(lambda: self._take(self.api.give(look.scan.id, type_name, source)))
+
+        ask_calibration(self._gui, type_name, offered, give)
+
     def _ask_export(self) -> None:
         look = self._look
         if look is not None:
@@ -490,6 +536,7 @@ class Session:
         if look is None:
             return
         self._stage.draw(look)
+        self._handed.draw(look)
         if self._settings is not None:
             self._settings.draw(look)
         self.load(lambda: self._draw_loaded(look), key="draw")
@@ -525,9 +572,9 @@ class Session:
                 self._cloud.set_panel_visible(False)
                 self._refresh_inspection(look)
         elif is_bare and not is_live(look) and self._left_by_hand != look.scan.id:
-            _, figures = self._pictures.figures()
-            if figures:
-                self._inspect(figures[0].camera)
+            found = self._pictures.figures()
+            if found is not None and found[1]:
+                self._inspect(found[1][0].camera)
                 self._showing_by_itself = True
 
     def _show_rig(self) -> None:
@@ -549,21 +596,30 @@ class Session:
         look, self._showing_by_itself = self._look, False
         if look is None:
             return
-        title, figures = self._pictures.figures()
-        figure = next((f for f in figures if f.camera == camera), None)
-        if figure is not None:
+        found = self._figure_of(camera)
+        if found is not None:
             self._cloud.set_panel_visible(False)
-            self._inspector.show(title, figure, self._picture_of(figure.source), look)
+            choice, figure = found
+            self._inspector.show(choice, figure, self._picture_of(figure.source), look)
+
+    def _figure_of(self, camera: str | None) -> tuple[Choice, Figure] | None:
+        found = self._pictures.figures()
+        if found is None:
+            return None
+        choice, figures = found
+        figure = next((f for f in figures if f.camera == camera), None)
+        return (choice, figure) if figure is not None else None
 
     def _refresh_inspection(self, look: Look) -> None:
         shown = self._inspector.figure
-        camera = shown.camera if shown else None
-        title, figures = self._pictures.figures()
-        figure = next((f for f in figures if f.camera == camera), None)
-        if figure is None:
-            self._leave_inspection()
-        elif figure != self._inspector.figure:
-            self._inspector.show(title, figure, self._picture_of(figure.source), look)
+        found = self._figure_of(shown.camera if shown else None)
+        if found is None:
+            # While its stage runs again the picture stays: the next one is on its way.
+            if not (look.running or look.stage.status in ("pending", "running")):
+                self._leave_inspection()
+        elif found[1] != self._inspector.figure:
+            choice, figure = found
+            self._inspector.show(choice, figure, self._picture_of(figure.source), look)
 
     def _picture_of(self, source: str) -> Any:
         is_inside = source.startswith("data:")

@@ -84,6 +84,12 @@ label.ug-step:hover { background: #232932; }
 .ug-progress > div { height: 100%; background: var(--ug-accent); border-radius: 3px; }
 .ug-ends { display: flex; justify-content: space-between; font-size: 11px; color: var(--ug-dim); font-variant-numeric: tabular-nums; }
 
+/* what was handed over */
+.ug-handed { margin: 0 12px 6px; padding: 5px 10px; font-size: 12px; line-height: 1.35; background: #1b2027; border-left: 3px solid #414a58; border-radius: 3px; display: flex; flex-wrap: wrap; gap: 0 8px; align-items: baseline; }
+.ug-handed.ug-on { border-left-color: #6fa3b8; }
+.ug-handed .ug-name { color: var(--ug-dim); } .ug-handed .ug-value { color: var(--ug-text); flex: 1; min-width: 120px; }
+.ug-handed > .ug-link { margin-left: 0; } .ug-handed .ug-links { white-space: nowrap; }
+
 /* findings, facts, tables */
 .ug-findings { margin: 2px 12px 6px; display: flex; flex-direction: column; gap: 3px; }
 .ug-finding { display: flex; gap: 8px; align-items: baseline; font-size: 12.5px; line-height: 1.35; color: var(--ug-text); }

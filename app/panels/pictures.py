@@ -80,14 +80,10 @@ class PicturesPanel:
         else:
             self._live[camera].image = rgb
 
-    def figures(self) -> tuple[str, list[Figure]]:
-        """Return the title and the pictures that are on the screen."""
+    def figures(self) -> tuple[Choice, list[Figure]] | None:
+        """Return what is on the screen and its pictures; None if there is nothing."""
         choice = self._chosen(choices(self._look)) if self._look else None
-        return (
-            (choice.field.hint.get("title", ""), self._figures_of(choice, _MAX_PX * 2))
-            if choice
-            else ("", [])
-        )
+        return (choice, self._figures_of(choice, _MAX_PX * 2)) if choice else None
 
     def _choose(self, label: str) -> None:
         if self._look is not None:

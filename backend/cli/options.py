@@ -11,6 +11,7 @@ from backend.domain.errors import InvalidSettingError
 
 if TYPE_CHECKING:
     from backend.contract.requests import GivenSource
+    from backend.services.array_uploads import UploadKind
     from backend.services.services import Services
 
 Settings = Annotated[
@@ -236,10 +237,11 @@ def with_uploads(
     InvalidSettingError
         If such a file isn't there or can't be read; the sentence names setting and file.
     """
+    kinds = _array_settings(services, method_name)
     return {
         stage: {
-            field: _uploaded(services, f"{stage}.{field}", value)
-            if (method_name, stage, field) in _array_settings(services, method_name)
+            field: _uploaded(services, f"{stage}.{field}", value, kinds[stage, field])
+            if (stage, field) in kinds
             else value
             for field, value in values.items()
         }
@@ -247,22 +249,24 @@ def with_uploads(
     }
 
 
-def _array_settings(services: "Services", method_name: str) -> set[tuple[str, str, str]]:
+def _array_settings(services: "Services", method_name: str) -> "dict[tuple[str, str], UploadKind]":
+    """Return the settings that name arrays; one that can be painted in a picture takes a mask."""
     from backend.domain.arrays import ARRAY_FORMAT
+    from backend.services.array_uploads import UploadKind
 
-    return {
-        (method_name, stage.name, field)
-        for method in services.methods().methods
-        if method.name == method_name
-        for stage in method.stages
-        for field, described in stage.settings.get("properties", {}).items()
-        if any(
-            one.get("format") == ARRAY_FORMAT for one in (described, *described.get("anyOf", ()))
-        )
-    }
+    method = next((m for m in services.methods().methods if m.name == method_name), None)
+    kinds = {}
+    for stage in method.stages if method else ():
+        painted = {shown.hint.get("edits") for shown in stage.shown}
+        for field, described in stage.settings.get("properties", {}).items():
+            ways = (described, *described.get("anyOf", ()))
+            if any(way.get("format") == ARRAY_FORMAT for way in ways):
+                is_mask = field in painted
+                kinds[stage.name, field] = UploadKind.MASK if is_mask else UploadKind.ARRAY
+    return kinds
 
 
-def _uploaded(services: "Services", path: str, value: Any) -> Any:
+def _uploaded(services: "Services", path: str, value: Any, kind: "UploadKind") -> Any:
     from backend.services.array_uploads import looks_like_hash
 
     if not isinstance(value, str) or looks_like_hash(value):
@@ -273,4 +277,4 @@ def _uploaded(services: "Services", path: str, value: Any) -> Any:
         raise InvalidSettingError(
             f"--set {path}={value}: the file can't be read ({error.strerror}); name a .npy file or a gray picture."
         ) from None
-    return services.upload_array(data).hash
+    return services.upload_array(data, kind).hash

@@ -51,7 +51,8 @@ class Picture(Hint):
     point: str | None = None
     """Field with the (x, y) that was chosen, drawn as a marker."""
     edits: str | None = None
-    """Setting that takes a point picked in the picture (with `point`), or a painted picture (without)."""
+    """Setting that takes a point picked in the picture (with `point`), or a painted picture (without): an
+    `ArrayHash` of factors in [0, 1], NaN where nothing was painted."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Mask(Hint):
     names: str | None = None
     """Field with a text per label, the first for label 1, where the texts depend on the result."""
     edits: str | None = None
-    """Setting that takes a painted mask."""
+    """Setting that takes a painted mask: an `ArrayHash` of a whole map, 0 where there is nothing."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class UploadKind(StrEnum):
     """What an upload is meant as."""
 
     MASK = "mask"
-    """h x w factors, stored as float32 in [0, 1]; a picture's full scale is 1."""
+    """h x w factors, stored as float32 in [0, 1]; a picture's full scale is 1, NaN is where nothing was painted."""
     ARRAY = "array"
     """Stored as it is: gray levels of a picture, any numbers of a `.npy` file."""
 
@@ -113,8 +113,9 @@ def _as_mask(array: Array) -> Array:
     if array.dtype.kind == "u":
         return (array / np.float32(np.iinfo(array.dtype).max)).astype(np.float32)
     values = array.astype(np.float32)
-    low, high = float(values.min()), float(values.max())
-    if not (low >= -_TOLERANCE and high <= 1 + _TOLERANCE):  # NaN fails both
+    painted = values[~np.isnan(values)]
+    low, high = float(painted.min(initial=1.0)), float(painted.max(initial=0.0))
+    if low < -_TOLERANCE or high > 1 + _TOLERANCE:
         raise InvalidSettingError(
             f"A mask's factors have to be from 0 to 1, but the upload has {low:g} to {high:g}: "
             "scale it, or save whole numbers of 8 or 16 bit."

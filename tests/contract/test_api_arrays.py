@@ -52,6 +52,7 @@ def picture(array: np.ndarray[Any, Any], suffix: str = ".png") -> bytes:
     [
         (npy(RAMP), RAMP),
         (npy(RAMP.astype(np.float64).T), RAMP.T),
+        (npy(np.where(RAMP > 0.5, np.nan, RAMP)), np.where(RAMP > 0.5, np.nan, RAMP)),
         (npy(RAMP > 0.5), (RAMP > 0.5).astype(np.float32)),
         (picture((RAMP * 255).astype(np.uint8)), (RAMP * 255).astype(np.uint8) / np.float32(255)),
         (
@@ -64,7 +65,7 @@ def picture(array: np.ndarray[Any, Any], suffix: str = ".png") -> bytes:
         ),
         (picture(np.full((2, 3), 255, np.uint8), ".tiff"), np.ones((2, 3), np.float32)),
     ],
-    ids=["npy", "transposed doubles", "booleans", "8 bit", "16 bit", "gray in colour", "tiff"],
+    ids=["npy", "transposed doubles", "painted in part", "booleans", "8 bit", "16 bit", "gray in colour", "tiff"],
 )
 def test_a_mask_is_kept_as_factors(client: httpx.Client, body: bytes, expected: Any) -> None:
     answer = client.post("/api/artifacts", content=body)
@@ -96,13 +97,13 @@ COLOURED = picture(np.arange(12, dtype=np.uint8).reshape(2, 2, 3))
         (npy(np.array(["a"])), "holds <U1: save numbers"),
         (npy(np.array([{}], dtype=object)), "can't be read"),
         (npy(RAMP * 2), "from 0 to 1, but the upload has 0 to 2"),
-        (npy(np.where(RAMP > 0.5, np.nan, RAMP)), "from 0 to 1, but the upload has nan"),
+        (npy(np.where(RAMP > 0.5, np.inf, RAMP)), "from 0 to 1, but the upload has 0 to inf"),
         (npy(RAMP[None]), "height x width, but the upload is 1 x 3 x 4"),
         (npy(np.zeros((0, 3))), "height x width, but the upload is 0 x 3"),
         (COLOURED, "is in colour: save it in shades of gray"),
         (bytes(GIANT), "60000 x 60000 px"),
     ],
-    ids=["empty", "text", "cut", "texts", "objects", "bright", "nan", "stack", "nothing", "colour", "giant"],
+    ids=["empty", "text", "cut", "texts", "objects", "bright", "inf", "stack", "nothing", "colour", "giant"],
 )  # fmt: skip
 def test_what_is_no_mask_is_refused_in_a_sentence(
     client: httpx.Client, body: bytes, sentence: str

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from backend.domain.arrays import ArrayHash
 from backend.domain.params import Params, setting
 from tests.ui.fake_scene import CAMERAS, EXPOSURES_MS, PERIODS, Array, scene
 
@@ -439,7 +440,73 @@ ODD = tuple(
     )
 )  # fmt: skip
 
+# ---- the third method: results that are painted on, picked in, and handed over
+
+
+class Levels(Params):
+    count: int = setting(8, title="Levels", ge=2, le=16)
+    """Uniform fields that are projected."""
+
+
+def make_levels(settings: dict[str, Any]) -> FakeResult:
+    s = scene()
+    light = np.linspace(20.0, 250.0, settings["count"])
+    slope = {c: (1.6 * s.albedo(c)).astype(np.float32) for c in CAMERAS}
+    offset = {c: np.full(slope[c].shape, 6.0, np.float32) for c in CAMERAS}
+    frames = tuple(
+        {
+            "camera": c, "exposure_ms": 20.0, "gain_db": 0.0, "role": "level", "bit_depth": 8,
+            "pattern": {"kind": "uniform", "gray": float(v)},
+            "image": np.clip(slope[c] * v + offset[c], 0, 255).astype(np.uint8),
+        }
+        for v in light for c in CAMERAS
+    )  # fmt: skip
+    return FakeResult(
+        f"{len(light)} levels captured",
+        (
+            FakeField("frames", _hint("frames", "Uniform fields", x="light", slope="slope", offset="offset"), frames=frames),
+            FakeField("light", _hint("data", ""), arrays={"": light}),
+            _picture("slope", "Slope", slope.__getitem__, unit="gray", colormap="viridis"),
+            FakeField("offset", _hint("data", ""), arrays=offset, per_camera=True),
+        ),
+    )  # fmt: skip
+
+
+class Mask(Params):
+    paint: ArrayHash | None = setting(None, title="Painted mask")
+    """Replaces the mask where it is painted."""
+    interval_gray: tuple[float, float] | None = setting(
+        None, title="Interval", unit="gray", auto="chosen_gray"
+    )
+    """Darkest and brightest gray level."""
+
+
+def make_mask(settings: dict[str, Any]) -> FakeResult:
+    y, x = np.mgrid[:200, :320]
+    factor = (1.0 - 0.8 * np.exp(-((x - 200.0) ** 2 + (y - 90.0) ** 2) / 1500.0)).astype(np.float32)
+    axis = np.arange(5.0, 256.0, 10.0)
+    low, high = np.meshgrid(axis, axis)
+    cost = np.where(high > low + 20, np.hypot(low - 45.0, high - 205.0) / 20 + 1.0, np.nan)
+    chosen = list(settings["interval_gray"] or (45.0, 205.0))
+    painted = "with paint" if settings["paint"] else "by itself"
+    return FakeResult(
+        f"Mask found, {painted}",
+        (
+            FakeField("factor", _hint("picture", "Intensity mask", unit="", colormap="gray", low=0.0, high=1.0, edits="paint"), arrays={"": factor}),
+            FakeField("cost", _hint("picture", "U over darkest and brightest gray level", unit="%", colormap="viridis", low=None, high=None, x="axis_gray", y="axis_gray", point="chosen_gray", edits="interval_gray"), arrays={"": cost}),
+            FakeField("axis_gray", _hint("data", ""), arrays={"": axis}),
+            FakeField("chosen_gray", _hint("data", ""), value=chosen),
+        ),
+    )  # fmt: skip
+
+
+MASKED = (
+    FakeStage("levels", "Response", "Capture uniform fields.", Levels, make_levels, captures=True),
+    FakeStage("mask", "Mask", "Find the mask.", Mask, make_mask, review="always"),
+)
+
 METHODS = {
+    "painted": ("Painted mask", "Levels, and a mask that is painted on.", MASKED),
     "hdr-fringe": (
         "Multi-exposure phase shifting",
         "Fringes at several exposures, two cameras.",

@@ -17,6 +17,7 @@ from backend.contract.scans import (
     DecisionView,
     FieldView,
     FrameRef,
+    HandedView,
     JobView,
     ScanState,
     ScanSummary,
@@ -66,6 +67,10 @@ class Scan:
     job: JobView | None = None
     trail: list[AuditEntry] = field(default_factory=list)
     cancelled: threading.Event = field(default_factory=threading.Event)
+    homography: str | None = None
+    """Where the handed-over homography comes from; None: there is none."""
+    kept: dict[str, int] = field(default_factory=dict)
+    """Run -> number of the calibration that it is kept as."""
 
     @property
     def stages(self) -> tuple[FakeStage, ...]:
@@ -147,7 +152,7 @@ class Scan:
             id=self.id, name=self.name, note=self.note, method=self.method, rig=self.rig, rig_options=self.rig_options,
             created=self.created, who=self.who, revision=self.revision, preset=None, status=self.overall(),
             stages=tuple(self._stage_state(s) for s in self.stages), job=self.job,
-            undo=f"{undo[0]['field']} of {undo[0]['stage']}" if undo else None,
+            undo=f"{undo[0]['field']} of {undo[0]['stage']}" if undo else None, handed=self._handed(),
         )  # fmt: skip
 
     def summary(self) -> ScanSummary:
@@ -160,6 +165,16 @@ class Scan:
             status=self.overall(), stages_done=done, stages=len(self.stages), points=points[-1] if points else None,
         )  # fmt: skip
 
+    def _handed(self) -> tuple[HandedView, ...]:
+        if self.method != "painted":
+            return ()
+        return (
+            HandedView(
+                type="TableHomography", title="Table homography", name="TableHomography", stages=("mask",), sentence=self.homography,
+                calibration=1 if self.homography else None,
+            ),
+        )  # fmt: skip
+
     def _stage_state(self, stage: FakeStage) -> StageState:
         run, status = self.current(stage), self.status(stage)
         quiet = "Running" if status is StageStatus.RUNNING else "Not run yet"
@@ -167,6 +182,7 @@ class Scan:
             name=stage.name, title=stage.title, status=status, message=run.result.sentence if run else quiet, key=self.key(stage),
             stage_run=run.id if run else None, take=self.takes.get(stage.name, 1), settings=self._setting_views(stage, run),
             checks=tuple(CheckView(**c) for c in run.result.checks) if run else (), fields=run.fields if run else (),
+            can_keep=run is not None and stage.name == "levels", kept=self.kept.get(run.id) if run else None,
             decision=run.decision if run else None, duration_s=0.84 if run else None, result_hash=run.id if run else None,
         )  # fmt: skip
 

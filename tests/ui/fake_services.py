@@ -3,6 +3,7 @@
 Tests look into the state and steer it: `go_on` holds jobs in the middle of a stage, `asked` tells who wanted what.
 """
 
+import io
 import secrets
 import threading
 from collections.abc import Iterator, Mapping
@@ -17,7 +18,16 @@ from backend.contract import requests
 from backend.contract.descriptions import MethodList
 from backend.contract.events import FrameCaptured, JobProgress, ScanChanged
 from backend.contract.rigs import RigOffer, RigView
-from backend.contract.scans import AuditEntry, DecisionView, JobView, ScanState, ScanSummary
+from backend.contract.scans import (
+    ArtifactRef,
+    AuditEntry,
+    CalibrationView,
+    DecisionView,
+    JobView,
+    PixelLevels,
+    ScanState,
+    ScanSummary,
+)
 from backend.domain.errors import (
     ConflictError,
     InvalidSettingError,
@@ -27,6 +37,7 @@ from backend.domain.errors import (
 from backend.domain.shots import Progress
 from backend.domain.states import JobStatus, StageStatus, Verdict
 from backend.services import previews
+from backend.services.array_uploads import UploadKind
 from backend.services.events import EventHub
 from backend.services.services import Services
 from tests.ui.fake_methods import METHODS, FakeStage
@@ -56,6 +67,8 @@ class FakeServices(Services):
         self.go_on = threading.Event()
         self.go_on.set()
         """Cleared by a test to hold jobs in the middle of a stage."""
+        self.kept: list[CalibrationView] = []
+        """Calibrations, newest first."""
         self._tick_s = tick_s
         self._lock = threading.RLock()
         self._jobs: list[threading.Thread] = []
@@ -107,6 +120,35 @@ class FakeServices(Services):
 
     def artifact_at(self, hash: str, x: int, y: int) -> Any:
         return previews.value_at(self.store.get(hash), x, y)
+
+    def levels_at(
+        self, scan: str, stage: str, field: str, *, camera: str, x: int, y: int
+    ) -> PixelLevels:
+        found = self.find(scan)
+        run = found.current(found.stage(stage))
+        assert run is not None
+        by_name = {view.name: view for view in run.fields}
+        gray = [
+            self.artifact_at(f.image.hash, x, y)
+            for f in by_name[field].frames
+            if f.camera == camera
+        ]
+        slope, offset = (
+            self.artifact_at(by_name[n].arrays[camera].hash, x, y) for n in ("slope", "offset")
+        )
+        axis = self.artifact(by_name["light"].arrays[""].hash)
+        return PixelLevels(
+            camera=camera, x=x, y=y, axis=tuple(axis.tolist()), gray=tuple(gray), exposure_ms=(20.0,) * len(gray), full_scale_gray=255.0,
+            slope=slope, offset=offset,
+        )  # fmt: skip
+
+    def upload_array(self, data: bytes, kind: UploadKind = UploadKind.MASK) -> ArtifactRef:
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+        self.asked.append(("", "upload", array))
+        reference = self.store.put(array)
+        whole = reference.model_copy(update={"hash": reference.hash * 2})  # as long as a real one
+        self.store.arrays[whole.hash] = array
+        return whole
 
     def cloud_preview(
         self, stage_run: str, field: str, *, budget: int = 300_000, scalar: str | None = None
@@ -214,6 +256,34 @@ class FakeServices(Services):
         found.cancelled.set()
         self.go_on.set()
         found.log(who, "cancelled", found.job.stage if found.job else None, "Job cancelled")
+        return self._changed(found)
+
+    def keep(self, stage_run: str, who: str) -> CalibrationView:
+        self.asked.append((who, "keep", stage_run))
+        scan, run = self._run(stage_run)
+        number = len(self.kept) + 1
+        scan.kept[run.id] = number
+        view = CalibrationView(
+            number=number, type="TableHomography", title="Table homography", rig=scan.rig, scan=scan.id, scan_name=scan.name,
+            stage=run.stage, who=who, when=datetime.now(UTC), result_hash=run.id, facts_hash="", calibration_hash=None, newest=True,
+        )  # fmt: skip
+        self.kept.insert(0, view)
+        self._changed(scan)
+        return view
+
+    def calibrations(self, rig: str | None = None) -> tuple[CalibrationView, ...]:
+        return tuple(self.kept)
+
+    def give(self, scan: str, type_name: str, source: requests.GivenSource, who: str) -> ScanState:
+        self.asked.append((who, "give", source))
+        found = self.find(scan)
+        found.homography = f"Calibration {source.calibration} of the rig: ‘Plane’, Bo"
+        return self._changed(found)
+
+    def take_away(self, scan: str, type_name: str, who: str) -> ScanState:
+        self.asked.append((who, "take away", type_name))
+        found = self.find(scan)
+        found.homography = None
         return self._changed(found)
 
     def export(
