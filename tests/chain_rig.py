@@ -26,9 +26,7 @@ class ChainRig:
     @property
     def facts(self) -> RigFacts:
         height, width = self.screen.height_px + 16, self.screen.width_px + 16
-        camera = CameraFacts(
-            width, height, self._bits, 0.1, 2000.0, 0.0, FULL_WELL_E, READ_NOISE_E
-        )
+        camera = CameraFacts(width, height, self._bits, 0.1, 2000.0, 0.0, FULL_WELL_E, READ_NOISE_E)
         return RigFacts({"camera": camera}, "camera", self.screen)
 
     def __call__(self, plan: Plan[T]) -> T:
@@ -43,9 +41,7 @@ class ChainRig:
 
     def expose(self, shot: Shot) -> Exposed:
         self.shots.append(shot)
-        codes = render(
-            shot.pattern, width_px=self.screen.width_px, height_px=self.screen.height_px
-        )
+        codes = render(shot.pattern, width_px=self.screen.width_px, height_px=self.screen.height_px)
         light = np.pad(self._chain.luminance(codes), 8)
         gray = self._chain.gray(
             light, shot.exposure_ms / self._nominal_ms, self._rng, bits=self._bits

@@ -94,7 +94,7 @@ def calibrate(chain: Chain, rng: np.random.Generator) -> Calibrated:
     )
     codes = np.unique(np.rint(np.linspace(0.0, 255.0, 33)))
     fields = tuple(
-        tuple(_uniform(chain, code, rng) for _ in range(2)) for code in codes.astype(int)
+        tuple(_uniform(chain, code, rng) for _ in range(2)) for code in codes.astype(int).tolist()
     )
     made = make_stack(pictures, base_exposure_ms=NOMINAL_MS)
     ramp = make_ramp(codes, fields)

@@ -102,7 +102,7 @@ class Linear:
     exposure_ms: Annotated[float | None, Value("Exposure of the fringes", unit="ms")]
     """Exposure for which `values` hold; None: an imported ramp that doesn't tell."""
     codes: Annotated[
-        Float[np.ndarray, "control"] | None, Curve("Display code, pre-distorted", unit="code")
+        Float[np.ndarray, "shown"] | None, Curve("Display code, pre-distorted", unit="code")
     ] = None
     """Display code in [0, 255] for equidistant control values from -1 to 1; None: code = 127.5 (Y + 1)."""
     predicted_mrad: Annotated[float, Value("Predicted phase error", unit="mrad")] = float("nan")
