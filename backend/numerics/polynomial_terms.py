@@ -48,6 +48,49 @@ def _power_table(values: Float[np.ndarray, "n"], order: int) -> list[Float64[np.
     return table
 
 
+def evaluate(
+    coefficients: Float[np.ndarray, "terms"], x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]
+) -> Float64[np.ndarray, "n"]:
+    """Sum up a polynomial at every point, by Horner's scheme: no table of terms.
+
+    Examples
+    --------
+    >>> evaluate(np.array([1.0, 0.0, 3.0, 0.0, 0.0, 0.5]), np.array([2.0]), np.array([4.0])).tolist()
+    [21.0]
+    """
+    order = order_of(coefficients.size)
+    ends = np.cumsum([order + 1 - j for j in range(order + 1)])
+    total = np.zeros(x.shape)
+    for j in reversed(range(order + 1)):
+        row = coefficients[ends[j] - (order + 1 - j) : ends[j]]
+        along = np.full(x.shape, row[-1])
+        for coefficient in row[-2::-1]:
+            along *= x
+            along += coefficient
+        total *= y
+        total += along
+    return total
+
+
+def derivatives(
+    coefficients: Float[np.ndarray, "terms"],
+) -> tuple[Float64[np.ndarray, "fewer"], Float64[np.ndarray, "fewer"]]:
+    """Return the coefficients of the derivatives by x and by y, one order lower.
+
+    Examples
+    --------
+    >>> by_x, by_y = derivatives(np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]))
+    >>> by_x.tolist(), by_y.tolist()
+    ([2.0, 6.0, 5.0], [4.0, 5.0, 12.0])
+    """
+    order = order_of(coefficients.size)
+    known = dict(zip(powers(order), coefficients.tolist(), strict=True))
+    lower = powers(order - 1)
+    by_x = [(i + 1) * known[i + 1, j] for i, j in lower]
+    by_y = [(j + 1) * known[i, j + 1] for i, j in lower]
+    return np.array(by_x), np.array(by_y)
+
+
 class ZernikeTerm(NamedTuple):
     """One Zernike polynomial, as OSA and ANSI number them."""
 

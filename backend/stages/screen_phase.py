@@ -47,6 +47,8 @@ DEFECT_RADIUS_SHARE = 0.02
 """Surroundings of a defect, as part of the picture's width."""
 MOST_RIPPLES_PER_PX = 0.9
 """Once per pixel, a ripple looks like the mirror's shape."""
+RIPPLE_WINDOW_PX = 200
+"""Half the side of the square in which ripples are looked for."""
 FIELD_SHARE = 0.15
 """Of the brightest change between dark and light field: where the screen changes less there is no mirror."""
 
@@ -451,13 +453,14 @@ def _rows(
     for one in sets:
         found = positions[one.axis]
         share = np.where(valid, found.share, np.float32(np.nan))
+        window = _window(valid)
         for place, of_one in enumerate(one.sets):
             finest = place == len(one.sets) - 1
             ripple = float("nan")
             if one.periods[0] <= 1:
-                smooth = _without_fringes(share, of_one) if finest else share
+                smooth = _without_fringes(share[window], of_one) if finest else share[window]
                 ripple = phase_ripple_rad(
-                    found.wrapped_rad[place],
+                    found.wrapped_rad[place][window],
                     smooth,
                     periods=of_one.periods,
                     harmonic=len(of_one.equal),
@@ -473,6 +476,16 @@ def _rows(
                 )
             )
     return tuple(rows)
+
+
+def _window(valid: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
+    """Return the middle of the valid pixels' extent: enough to see a ripple."""
+    parts = []
+    for axis in (0, 1):
+        places = np.flatnonzero(valid.any(axis=1 - axis))
+        middle = int(places.mean()) if places.size else 0
+        parts.append(slice(max(0, middle - RIPPLE_WINDOW_PX), middle + RIPPLE_WINDOW_PX))
+    return parts[0], parts[1]
 
 
 def _without_fringes(
