@@ -33,6 +33,9 @@ MOST_TRIALS = 16
 SATURATED_SHARE = 1e-3
 """Of the bright pixels: dead and hot ones must not decide."""
 
+UNSEEN_SHARE = 0.2
+"""Pictures of white and black that differ by less than this share of white differ by noise and stray light only."""
+
 NEAR_ENOUGH = 0.04
 """The search ends when exposures that do and don't saturate differ by this."""
 
@@ -146,7 +149,8 @@ def _region_plan(
     dark = (yield (shot,))[0][camera]
     light = white.gray.astype(np.float32) - dark.gray.astype(np.float32)
     brightest = float(np.quantile(light, 0.995))
-    if brightest < 0.02 * white.full_scale_gray:
+    whitest = float(np.quantile(white.gray, 0.995))
+    if brightest < max(0.02 * white.full_scale_gray, UNSEEN_SHARE * whitest):
         raise StageFailedError(
             f"The screen isn't seen at {white.exposure_ms:.0f} ms, white is {brightest:.1f} gray above black: "
             "turn the mirror until the camera sees the screen in it, or expose longer."
