@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
@@ -22,8 +23,9 @@ from backend.api.server import TokensHidden, public_socket, server_for
 from backend.api.sessions import Sessions, Tokens
 from backend.api.station import Station
 from backend.contract.rigs import RigOffer
-from backend.devices.loading import open_rig
+from backend.devices.pages import PageDesk
 from backend.devices.protocols import Rig
+from backend.devices.rig_shelf import RigShelf
 from backend.domain.errors import StartupError
 from backend.jobs.execution import Workshop
 from backend.jobs.rigs import OpenRig, RigPool
@@ -31,7 +33,7 @@ from backend.jobs.runner import LocalRunner, Runner
 from backend.methods import registry
 from backend.numerics.warm_up import warm_up
 from backend.services.events import EventHub
-from backend.services.rig_offers import offer_rigs
+from backend.services.rig_offers import offer_kept_rigs, offer_rigs
 from backend.services.services import Services
 from backend.settings import Settings, load_settings
 from backend.storage.artifacts import LocalArtifactStore
@@ -47,7 +49,10 @@ def local_runner(shop: Workshop) -> Runner:
 
 
 def build_services(
-    settings: Settings, *, make_runner: Callable[[Workshop], Runner] = local_runner
+    settings: Settings,
+    *,
+    make_runner: Callable[[Workshop], Runner] = local_runner,
+    pages: PageDesk | None = None,
 ) -> Services:
     """Open database and store, and put the services on top.
 
@@ -55,6 +60,8 @@ def build_services(
     ----------
     settings
         Where the data are.
+    pages
+        The projector pages of the application; None: no page can be reached.
     make_runner
         Makes what carries out the jobs: `local_runner` for a server, `InlineRunner` for a command.
 
@@ -77,7 +84,8 @@ def build_services(
         database.close()
         raise
     events = EventHub()
-    rigs = RigPool(rig_opener(settings), events.publish)
+    shelf = RigShelf(settings.rig_folder, pages or PageDesk())
+    rigs = RigPool(rig_opener(settings, shelf), events.publish)
     shop = Workshop(database, store, rigs, registry, events.publish)
     return Services(
         database=database,
@@ -87,23 +95,23 @@ def build_services(
         registry=registry(),
         events=events,
         version=version("unglare"),
-        offers=lambda: rig_offers(settings),
+        offers=lambda: rig_offers(settings, shelf),
     )
 
 
-def rig_opener(settings: Settings) -> OpenRig:
+def rig_opener(settings: Settings, shelf: RigShelf) -> OpenRig:
     """Return what opens rigs: this station's own gets the options of the settings, where a scan names no others."""
 
     def opened(name: str, options: Mapping[str, Any]) -> Rig:
         own = settings.rig_options if name == settings.rig else {}
-        return open_rig(name, {**own, **options})
+        return shelf.open(name, {**own, **options})
 
     return opened
 
 
-def rig_offers(settings: Settings) -> tuple[RigOffer, ...]:
+def rig_offers(settings: Settings, shelf: RigShelf) -> tuple[RigOffer, ...]:
     """Offer this station's own rig first, also one that has no name but `package.module:factory`."""
-    known = offer_rigs()
+    known = (*offer_rigs(), *offer_kept_rigs(shelf))
     own = [offer for offer in known if offer.name == settings.rig]
     others = [offer for offer in known if offer.name != settings.rig]
     unnamed = RigOffer(name=settings.rig, title=settings.rig, doc="", options_schema={})
@@ -111,7 +119,12 @@ def rig_offers(settings: Settings) -> tuple[RigOffer, ...]:
 
 
 def build_application(
-    settings: Settings, services: Services, *, port: int, token: str | None = None
+    settings: Settings,
+    services: Services,
+    *,
+    port: int,
+    token: str | None = None,
+    pages: PageDesk | None = None,
 ) -> FastAPI:
     """Make the application around services; nothing listens and no process runs yet.
 
@@ -125,6 +138,8 @@ def build_application(
         Where it will be served: the station calls it there, and the cookie bears its number.
     token
         The operators' token; None: that of the settings.
+    pages
+        Where projector pages are brought together with their drivers: the services' own.
 
     Raises
     ------
@@ -144,15 +159,15 @@ def build_application(
         cookie_name=f"unglare-{port}",
         data_folder=settings.data_folder,
         upload_limit_bytes=settings.upload_limit_mb * 2**20,
+        pages=pages or PageDesk(),
     )
     return create_api(
         context, station=station if settings.station else None, threads=settings.threads
     )
 
 
-def _say(text: str) -> None:
-    """Print at once: in a file or a pipe the address would wait for more lines, which never come."""
-    print(text, flush=True)
+_say = partial(print, flush=True)
+"""Prints at once: in a file or a pipe the address would wait for more lines, which never come."""
 
 
 def serve(
@@ -188,11 +203,12 @@ def serve(
         contextlib.suppress(KeyboardInterrupt),
     ):
         port = listening.getsockname()[1]
-        with contextlib.closing(build_services(settings)) as services:
+        pages = PageDesk()
+        with contextlib.closing(build_services(settings, pages=pages)) as services:
             interrupted = services.recover()
             if interrupted:
                 _log.warning("%d runs were interrupted when the server stopped.", interrupted)
-            app = build_application(settings, services, port=port, token=token)
+            app = build_application(settings, services, port=port, token=token, pages=pages)
             announce(_welcome(settings, port, token))
             if prepare is not None:
                 threading.Thread(

@@ -91,6 +91,11 @@ class Settings(BaseSettings):
         """Folder of the local artifact store."""
         return self.data_folder / "artifacts"
 
+    @property
+    def rig_folder(self) -> Path:
+        """Folder of the station's rig files."""
+        return self.data_folder / "rigs"
+
 
 def load_settings(**given: Any) -> Settings:
     """Read the settings; what is given here (from a command line) counts more than the environment.

@@ -19,6 +19,7 @@ from backend.api import (
     metrics,
     pages,
     problems,
+    projector_page,
     proxy,
     scans,
 )
@@ -78,6 +79,7 @@ def _everything() -> APIRouter:
     everything.include_router(health.public, prefix="/api")
     everything.include_router(docs.page)
     everything.include_router(pages.router)
+    everything.include_router(projector_page.router)
     everything.include_router(proxy.router)
     return everything
 

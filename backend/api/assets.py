@@ -14,6 +14,8 @@ PUBLIC = {
     "import.js": "text/javascript; charset=utf-8",
     "login.js": "text/javascript; charset=utf-8",
     "logo.svg": "image/svg+xml",
+    "projector.css": "text/css; charset=utf-8",
+    "projector.js": "text/javascript; charset=utf-8",
     "theme.css": "text/css; charset=utf-8",
 }
 """Files that anybody may fetch, with their media types; nothing in them is secret."""

@@ -10,6 +10,7 @@ from fastapi import Depends, Request
 from starlette.requests import HTTPConnection
 
 from backend.api.sessions import Sessions
+from backend.devices.pages import PageDesk
 from backend.services.services import Services
 
 
@@ -62,6 +63,8 @@ class Context:
     data_folder: Path
     upload_limit_bytes: int
     sockets: Sockets = field(default_factory=Sockets)
+    pages: PageDesk = field(default_factory=PageDesk)
+    """Projector pages; the drivers of page projectors look for theirs here."""
 
 
 def context_of(connection: HTTPConnection) -> Context:

@@ -4,6 +4,8 @@ from functools import lru_cache
 
 from backend.contract.rigs import RigOffer
 from backend.devices import loading
+from backend.devices.rig_file import RigFile
+from backend.devices.rig_shelf import KeptRig, RigShelf
 from backend.domain.errors import UnglareError
 
 
@@ -12,11 +14,28 @@ def offer_rigs() -> tuple[RigOffer, ...]:
     return tuple(_offer(entry.name, entry.package) for entry in loading.available_rigs())
 
 
+def offer_kept_rigs(shelf: RigShelf) -> tuple[RigOffer, ...]:
+    """Describe the station's rig files; one that can't be used is offered with the reason why not."""
+    return tuple(_kept(rig) for rig in shelf.kept())
+
+
+def _kept(rig: KeptRig) -> RigOffer:
+    offer = RigOffer(name=rig.name, title=_title(rig.name), doc=str(rig.path), options_schema={})
+    try:
+        file = RigFile.read(rig.path)
+    except UnglareError as error:
+        return offer.model_copy(update={"error": error.sentence})
+    return offer.model_copy(update={"title": file.title or offer.title})
+
+
 @lru_cache(maxsize=64)
 def _offer(name: str, package: str) -> RigOffer:
-    title = name.replace("-", " ").replace("_", " ").capitalize()
-    offer = RigOffer(name=name, title=title, doc=package, options_schema={})
+    offer = RigOffer(name=name, title=_title(name), doc=package, options_schema={})
     try:
         return offer.model_copy(update={"options_schema": loading.options_schema(name)})
     except UnglareError as error:
         return offer.model_copy(update={"error": error.sentence})
+
+
+def _title(name: str) -> str:
+    return name.replace("-", " ").replace("_", " ").capitalize()

@@ -64,7 +64,7 @@ class TestAravisOnGigEVision(RigConformance):
     def rig(self, addresses):
         with network(addresses) as (simulated, _):
             cameras = {
-                name: AravisCamera(name, AravisOptions(address))
+                name: AravisCamera(name, AravisOptions(address=address))
                 for name, address in zip(("left", "right"), addresses, strict=True)
             }
             sensors = dict.fromkeys(cameras, SensorFacts(8, 4.0, 15_300.0, 12.0))
@@ -73,7 +73,7 @@ class TestAravisOnGigEVision(RigConformance):
 
 
 def opened(addresses: tuple[str, str], **options: object) -> AravisCamera:
-    camera = AravisCamera("left", AravisOptions(addresses[0], **options))
+    camera = AravisCamera("left", AravisOptions(address=addresses[0], **options))
     camera.open()
     camera.configure(replace(camera.settings, exposure_us=10_000.0))
     return camera
@@ -88,7 +88,7 @@ def test_known_addresses_are_asked_one_by_one(addresses):
 
 
 def test_nobody_at_the_address_is_one_sentence(addresses):
-    camera = AravisCamera("left", AravisOptions(addresses[0]))
+    camera = AravisCamera("left", AravisOptions(address=addresses[0]))
     with pytest.raises(DeviceNotFound, match=f"left: no camera answers at {addresses[0]}"):
         camera.open()
     assert camera.state is LinkState.CLOSED
@@ -96,7 +96,7 @@ def test_nobody_at_the_address_is_one_sentence(addresses):
 
 def test_a_second_controller_is_refused(addresses):
     with network(addresses), opened(addresses) as camera:
-        other = AravisCamera("other", AravisOptions(addresses[0]))
+        other = AravisCamera("other", AravisOptions(address=addresses[0]))
         with pytest.raises(DeviceBusy, match="another program controls"):
             other.open()
         camera.arm()
@@ -175,7 +175,7 @@ def test_a_line_triggered_sequence_brings_every_frame(addresses):
         projector.load(patterns)
         cameras = []
         for name, address in zip(("left", "right"), addresses, strict=True):
-            camera = stack.enter_context(AravisCamera(name, AravisOptions(address)))
+            camera = stack.enter_context(AravisCamera(name, AravisOptions(address=address)))
             camera.configure(
                 replace(camera.settings, exposure_us=12_000.0, trigger=TriggerSource.LINE1)
             )

@@ -14,6 +14,8 @@ import httpx
 import pytest
 
 from backend.contract.requests import CreateScan
+from backend.devices.pages import PageDesk
+from backend.devices.rig_shelf import RigShelf
 from backend.domain.errors import StartupError
 from backend.domain.states import JobStatus
 from backend.jobs.runner import InlineRunner
@@ -152,14 +154,18 @@ def test_the_stations_own_rig_is_offered_first_and_opened_with_its_options(
         opened.append((name, options))
         return ToyRig(name, options, Faults())
 
-    monkeypatch.setattr("backend.main.open_rig", note)
+    monkeypatch.setattr("backend.devices.rig_shelf.open_rig", note)
     settings = settings_in(tmp_path, rig="lab.rigs:shiny", rig_options={"port": 7, "fast": True})
 
-    opener = rig_opener(settings)
+    shelf = RigShelf(tmp_path / "rigs", PageDesk())
+    opener = rig_opener(settings, shelf)
     opener("lab.rigs:shiny", {"fast": False})
     opener("simulated", {"seed": 1})
 
-    assert [offer.name for offer in rig_offers(settings)][:2] == ["lab.rigs:shiny", "simulated"]
+    assert [offer.name for offer in rig_offers(settings, shelf)][:2] == [
+        "lab.rigs:shiny",
+        "simulated",
+    ]
     assert opened == [
         ("lab.rigs:shiny", {"port": 7, "fast": False}),
         ("simulated", {"seed": 1}),

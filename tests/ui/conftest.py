@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, Playwright, sync_playwright
 
 from backend.api.sessions import Role
 from backend.contract.requests import CreateScan
@@ -30,16 +30,27 @@ def served() -> Iterator[Served]:
 
 
 @pytest.fixture(scope="session")
-def chromium() -> Iterator[Browser]:
+def playwright() -> Iterator[Playwright]:
+    """There can be only one in a process."""
+    with sync_playwright() as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def chromium_program() -> str:
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     if program is None:
         pytest.skip("chromium isn't installed: apt-get install chromium")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=program, headless=True, args=SOFTWARE_GL
-        )
-        yield browser
-        browser.close()
+    return program
+
+
+@pytest.fixture(scope="session")
+def chromium(playwright: Playwright, chromium_program: str) -> Iterator[Browser]:
+    browser = playwright.chromium.launch(
+        executable_path=chromium_program, headless=True, args=SOFTWARE_GL
+    )
+    yield browser
+    browser.close()
 
 
 @pytest.fixture(scope="session")

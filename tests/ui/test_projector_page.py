@@ -1,15 +1,13 @@
 """The projector page in a real browser, driven by the real driver through the real server."""
 
 import io
-import shutil
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import BrowserContext, Page, sync_playwright
+from playwright.sync_api import BrowserContext, Page, Playwright
 
 from backend.devices.drivers.page_projector import PageOptions, PageProjector
 from backend.devices.errors import (
@@ -40,31 +38,34 @@ def address(desk: PageDesk, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         yield served
 
 
-@contextmanager
-def window(folder: Path, *, ratio: float = 1.0) -> Iterator[BrowserContext]:
-    """Open a browser whose device pixels are really so many per CSS pixel: emulation would hide it from the page."""
-    program = shutil.which("chromium")
-    if program is None:
-        pytest.skip("chromium isn't installed: apt-get install chromium")
-    flags = [
-        *SOFTWARE_GL,
-        f"--force-device-scale-factor={ratio}",
-        "--force-color-profile=srgb",
-        "--hide-scrollbars",
-    ]
-    css = tuple(round(pixels / ratio) for pixels in SIZE)
-    with sync_playwright() as playwright:
+Window = Callable[..., AbstractContextManager[BrowserContext]]
+
+
+@pytest.fixture(scope="module")
+def window(
+    playwright: Playwright, chromium_program: str, tmp_path_factory: pytest.TempPathFactory
+) -> Window:
+    """Return what opens a browser with so many device pixels per CSS pixel: emulation would hide it from the page."""
+
+    @contextmanager
+    def open_window(ratio: float = 1.0) -> Iterator[BrowserContext]:
+        css = tuple(round(pixels / ratio) for pixels in SIZE)
         browser = playwright.chromium.launch_persistent_context(
-            folder, executable_path=program, headless=True, no_viewport=True,
-            args=[*flags, f"--window-size={css[0]},{css[1]}"],
+            tmp_path_factory.mktemp("profile"), executable_path=chromium_program, headless=True, no_viewport=True,
+            args=[
+                *SOFTWARE_GL, f"--force-device-scale-factor={ratio}", "--force-color-profile=srgb",
+                "--hide-scrollbars", f"--window-size={css[0]},{css[1]}",
+            ],
         )  # fmt: skip
         yield browser
         browser.close()
 
+    return open_window
+
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserContext]:
-    with window(tmp_path_factory.mktemp("profile")) as opened:
+def browser(window: Window) -> Iterator[BrowserContext]:
+    with window() as opened:
         yield opened
 
 
@@ -115,9 +116,9 @@ def seen(page: Page, shape: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("ratio", [1.0, 1.25, 2.0])
 def test_every_pixel_is_drawn_exactly(
-    ratio: float, desk: PageDesk, address: str, tmp_path: Path
+    ratio: float, desk: PageDesk, address: str, window: Window
 ) -> None:
-    with window(tmp_path, ratio=ratio) as browser:
+    with window(ratio) as browser:
         page = show_projector(browser, address)
         with opened(desk) as projector:
             shown = patterns(*true_size(desk))
@@ -145,13 +146,12 @@ def test_without_a_page_the_way_out_is_said() -> None:
 
 
 def test_a_second_page_is_refused_and_the_first_goes_on(
-    page: Page, browser: BrowserContext, address: str, desk: PageDesk
+    page: Page, window: Window, address: str, desk: PageDesk
 ) -> None:
-    with opened(desk) as projector:
-        second = show_projector(browser, address)
+    with opened(desk) as projector, window() as other:
+        second = show_projector(other, address)
         second.get_by_text("Another page is this projector already").wait_for()
         assert projector.blank(10).index == -1
-        second.close()
 
 
 def test_viewers_have_no_projector(browser: BrowserContext, address: str, desk: PageDesk) -> None:

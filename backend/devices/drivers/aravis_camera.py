@@ -7,11 +7,13 @@ Nothing is ever broadcast here: that is discovery, and only done when an operato
 import ctypes
 import threading
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
+from pydantic import model_validator
 
 from backend.devices.drivers.aravis_library import (
     Aravis,
@@ -31,6 +33,7 @@ from backend.devices.errors import (
     IncompleteFrame,
     UnsupportedFeature,
 )
+from backend.devices.options import DriverOptions, read_options
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -62,9 +65,8 @@ _UNKNOWN = CameraCapabilities((0, 0), (), Range(0, 0), Range(0, 0), ())
 """Before a camera was opened: it can't be set to anything."""
 
 
-@dataclass(frozen=True)
-class AravisOptions:
-    """How a camera is found and connected."""
+class AravisOptions(DriverOptions):
+    """How a camera is found and connected; one of address and serial."""
 
     address: str = ""
     """IPv4 address of a GigE Vision camera."""
@@ -72,6 +74,19 @@ class AravisOptions:
     """Serial number of a USB3 Vision camera."""
     packet_bytes: int | None = None
     """Size of stream packets; None: the largest that gets through, found by test packets."""
+
+    @model_validator(mode="after")
+    def _findable(self) -> "AravisOptions":
+        if bool(self.address) == bool(self.serial):
+            raise ValueError(
+                "give either the address of a GigE Vision camera or the serial of a USB3 Vision one"
+            )
+        return self
+
+
+def create_camera(name: str, options: Mapping[str, Any]) -> "AravisCamera":
+    """Make a camera of a rig file's entry."""
+    return AravisCamera(name, read_options(AravisOptions, name, options))
 
 
 class AravisCamera(DriverLink):

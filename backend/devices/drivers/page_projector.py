@@ -1,0 +1,214 @@
+"""A browser window on the projector's screen, or on the screen of a deflectometry rig, as projector.
+
+The browser's acknowledgement after two animation frames says *submitted*, not *lit*: what the screen and its
+electronics add is measured by the latency calibration and waited for here, in `settle_ms`.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from backend.devices.drivers.link import DriverLink
+from backend.devices.errors import (
+    DeviceDisconnected,
+    DeviceError,
+    DeviceNotFound,
+    DeviceTimeout,
+    FeatureError,
+    GeometryError,
+)
+from backend.devices.options import DisplaySize, DriverOptions, read_options
+from backend.devices.pages import Geometry, Page, PageDesk
+from backend.devices.protocols import DeviceInfo, LinkState, Presented, ProjectorCapabilities
+
+_JOIN_S = 5.0
+_GEOMETRY_S = 2.0
+
+
+class PageOptions(DriverOptions):
+    """How the page's screen is driven."""
+
+    size: DisplaySize
+    """Width and height of the projector in [px]: what the page shows is never scaled."""
+    page: str = "projector"
+    """Name in the page's address."""
+    refresh_hz: float | None = 60.0
+    settle_ms: float | None = None
+    """From the acknowledgement to the light, as the latency calibration found it; None: not measured yet."""
+
+
+def create_projector(name: str, options: Mapping[str, Any], desk: PageDesk) -> "PageProjector":
+    """Make a projector of a rig file's entry."""
+    return PageProjector(name, read_options(PageOptions, name, options), desk)
+
+
+class PageProjector(DriverLink):
+    """A `Projector` in a browser."""
+
+    def __init__(self, name: str, options: PageOptions, desk: PageDesk) -> None:
+        super().__init__(
+            name,
+            DeviceInfo(
+                "", "browser page", driver="page", address=f"/projector?name={options.page}"
+            ),
+        )
+        self._options = options
+        self._desk = desk
+        self._page: Page | None = None
+        self._place: tuple[float, float, str] | None = None
+        self._patterns: list[UInt8[np.ndarray, "h w"]] = []
+        self._request = 0
+        self._stop = threading.Event()
+        self.settle_ms = options.settle_ms
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        """What it can do."""
+        return ProjectorCapabilities(size=self._options.size, refresh_hz=self._options.refresh_hz)
+
+    def open(self) -> None:
+        """Take the page that is open at the projector's address."""
+        if self._state in (LinkState.READY, LinkState.ARMED):
+            return
+        self._stop.clear()
+        page = self._desk.find(self._options.page, _JOIN_S)
+        if page is None:
+            raise DeviceNotFound(
+                self.name,
+                f"no projector page is open; open {self._info.address} full screen on the projector's monitor,"
+                " or run `unglare projector`",
+            )
+        geometry = page.wait_for_geometry(_GEOMETRY_S)
+        if geometry is None:
+            raise DeviceTimeout(
+                self.name, "the projector page doesn't say how large it is; reload it"
+            )
+        self._refuse_scaled(geometry)
+        self._page, self._place = page, geometry.place
+        self._state = LinkState.READY
+        self._send_patterns()
+
+    def close(self) -> None:
+        """Let the page go; it stays open."""
+        self._stop.set()
+        self._page = None
+        self._state = LinkState.CLOSED
+
+    def reconnect(self, timeout_s: float = 10.0) -> None:
+        """Take the page again once it is back; patterns are loaded again."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            self.close()
+            try:
+                self.open()
+                return
+            except (DeviceNotFound, DeviceTimeout) as error:
+                if time.monotonic() > deadline_s:
+                    raise self._lose(f"the page didn't come back within {timeout_s:g} s") from error
+
+    def load(self, patterns: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
+        """Send patterns to the page, so that showing them needs no network."""
+        self._need_link()
+        width, height = self._options.size
+        for index, pattern in enumerate(patterns):
+            if pattern.shape != (height, width):
+                size = "x".join(map(str, pattern.shape[::-1]))
+                raise GeometryError(
+                    self.name,
+                    f"pattern {index} is {size}, the display {width}x{height}; render patterns in the display's size",
+                )
+        self._patterns = [np.ascontiguousarray(pattern).copy() for pattern in patterns]
+        self._send_patterns()
+
+    def show(self, index: int, timeout_s: float = 2.0) -> Presented:
+        """Show a loaded pattern; returns after the page's acknowledgement and the settle time."""
+        self._need_link()
+        if not 0 <= index < len(self._patterns):
+            raise FeatureError(
+                self.name, f"there is no pattern {index}, {len(self._patterns)} are loaded; load first"
+            )  # fmt: skip
+        return self._asked({"t": "show", "slot": index}, index, timeout_s)
+
+    def blank(self, level: int = 0) -> Presented:
+        """Show the whole field at one code."""
+        self._need_link()
+        if not 0 <= level <= 255:
+            raise FeatureError(self.name, f"level {level} is not within 0 to 255; choose another")
+        width, height = self._options.size
+        return self._asked({"t": "blank", "level": level, "w": width, "h": height}, -1, 2.0)
+
+    def _send_patterns(self) -> None:
+        page, (width, height) = self._connected(), self._options.size
+        for slot, pattern in enumerate(self._patterns):
+            page.send({"t": "load", "slot": slot, "w": width, "h": height}, pattern.tobytes())
+
+    def _asked(self, message: dict[str, object], index: int, timeout_s: float) -> Presented:
+        page = self._connected()
+        self._request += 1
+        page.send({**message, "id": self._request})
+        reply = page.wait_for_reply(self._request, timeout_s)
+        if reply is None:
+            raise self._silent(page, timeout_s)
+        if reply.code:
+            raise self._refused(reply.code)
+        self._refuse_moved(page)
+        self._stop.wait((self.settle_ms or 0.0) / 1000.0)
+        return Presented(index, time.monotonic(), None, confirmed=self.settle_ms is not None)
+
+    def _connected(self) -> Page:
+        if self._page is None or self._page.gone:
+            raise self._lose("the projector page was closed or reloaded")
+        return self._page
+
+    def _silent(self, page: Page, timeout_s: float) -> DeviceError:
+        if page.gone:
+            return self._lose("the projector page was closed or reloaded")
+        if page.geometry is not None and not page.geometry.visible:
+            return GeometryError(
+                self.name, "the projector page is hidden; bring it to the front of its monitor"
+            )
+        return DeviceTimeout(
+            self.name, f"the projector page didn't draw within {timeout_s:g} s; is it frozen?"
+        )
+
+    def _refused(self, code: str) -> DeviceError:
+        if code == "no-slot":  # a page that was reloaded has forgotten its patterns
+            return self._lose("the projector page has lost its patterns")
+        return DeviceDisconnected(self.name, f"the projector page failed ({code}); reload it")
+
+    def _refuse_moved(self, page: Page) -> None:
+        geometry = page.geometry
+        if geometry is None:
+            return
+        self._refuse_scaled(geometry)
+        if geometry.place != self._place:
+            self._state = LinkState.LOST
+            raise GeometryError(
+                self.name,
+                f"the window moved to another place or screen ({_where(geometry)}); put it back and reconnect",
+            )
+
+    def _refuse_scaled(self, geometry: Geometry) -> None:
+        """Refuse unless every pattern pixel is one device pixel: within the rounding of a fractional ratio."""
+        width, height = self._options.size
+        slack = max(1, math.ceil(geometry.ratio))
+        exact = 0 <= geometry.width_px - width < slack and 0 <= geometry.height_px - height < slack
+        if exact and geometry.scale == 1.0 and geometry.visible:
+            return
+        hidden = "" if geometry.visible else ", hidden"
+        raise GeometryError(
+            self.name,
+            f"the page has {geometry.width_px}x{geometry.height_px} device pixels at ratio {geometry.ratio:g}, zoom"
+            f" {geometry.scale:g}{hidden}, the patterns {width}x{height}; show it full screen at 100 % on the"
+            " projector's monitor",
+        )
+
+
+def _where(geometry: Geometry) -> str:
+    screen = f", {geometry.screen}" if geometry.screen else ""
+    return f"x {geometry.screen_x:g}, y {geometry.screen_y:g}{screen}"

@@ -1,0 +1,167 @@
+"""Projector pages: browser windows on a projector's screen, and how drivers reach them.
+
+A page connects to the application, not the other way round. The desk brings both together: whoever serves
+the page's websocket hands the connection in, the driver of the projector takes it out by the page's name.
+
+Messages to a page are JSON texts; pixels follow as one binary message of gray bytes, row by row::
+
+    to the page     {"t": "load", "slot": k, "w": .., "h": ..} + pixels     {"t": "show", "id": n, "slot": k}
+                    {"t": "blank", "id": n, "level": v, "w": .., "h": ..}
+    from the page   {"t": "geometry", ...}      {"t": "ack", "id": n, "geometry": {...}}
+                    {"t": "error", "id": n, "code": "no-slot"}
+"""
+
+import json
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+SECOND_PAGE = 4009
+"""Close code of a page that came second."""
+NOT_OURS = 4008
+"""Close code of a page that says what no page of ours says."""
+
+
+class Geometry(BaseModel):
+    """Where a page is and how it draws, in its own words."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    width_px: int
+    """Device pixels of the window's content."""
+    height_px: int
+    ratio: float
+    """Device pixels per CSS pixel."""
+    scale: float = 1.0
+    """Pinch zoom."""
+    visible: bool = True
+    screen_x: float = 0.0
+    screen_y: float = 0.0
+    """Where the window stands, in CSS pixels: another place is another screen."""
+    screen: str = ""
+    """What the browser tells of the screen."""
+
+    @property
+    def place(self) -> tuple[float, float, str]:
+        """What changes when the window goes to another screen."""
+        return self.screen_x, self.screen_y, self.screen
+
+
+@runtime_checkable
+class Connection(Protocol):
+    """A page's websocket. Called from any thread; returns before the message is out."""
+
+    def send_text(self, text: str) -> None:
+        """Send a text message."""
+        ...
+
+    def send_bytes(self, data: bytes) -> None:
+        """Send a binary message."""
+        ...
+
+    def close(self, code: int, reason: str) -> None:
+        """End the connection."""
+        ...
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a page said to one request."""
+
+    id: int
+    code: str
+    """Empty: done; else what went wrong."""
+
+
+class Page:
+    """One connected page: requests out, replies in. Threads may wait for it."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._changed = threading.Condition()
+        self._geometry: Geometry | None = None
+        self._replies: dict[int, Reply] = {}
+        self._gone = False
+
+    @property
+    def geometry(self) -> Geometry | None:
+        """The newest geometry that it told."""
+        return self._geometry
+
+    @property
+    def gone(self) -> bool:
+        """Whether it was closed."""
+        return self._gone
+
+    def send(self, message: Mapping[str, Any], pixels: bytes | None = None) -> None:
+        """Send a request, and the pixels that belong to it."""
+        self._connection.send_text(json.dumps(message))
+        if pixels is not None:
+            self._connection.send_bytes(pixels)
+
+    def wait_for_geometry(self, timeout_s: float) -> Geometry | None:
+        """Wait until the page has told where it is."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._geometry or self._gone, timeout_s)
+            return self._geometry
+
+    def wait_for_reply(self, request_id: int, timeout_s: float) -> Reply | None:
+        """Wait for the answer to a request; None if none came, or the page is gone."""
+        with self._changed:
+            self._changed.wait_for(lambda: request_id in self._replies or self._gone, timeout_s)
+            return self._replies.pop(request_id, None)
+
+    def told(self, text: str) -> None:
+        """Take what the page says; what isn't ours closes it."""
+        try:
+            message = json.loads(text)
+            self._note(message["t"], message)
+        except (ValueError, KeyError, TypeError, ValidationError):
+            self._connection.close(NOT_OURS, "this isn't the projector page's language")
+
+    def left(self) -> None:
+        """Note that the connection has ended."""
+        with self._changed:
+            self._gone = True
+            self._changed.notify_all()
+
+    def _note(self, kind: str, message: Mapping[str, Any]) -> None:
+        told = message.get("geometry") if kind != "geometry" else message
+        geometry = Geometry.model_validate(told) if told else None
+        with self._changed:
+            self._geometry = geometry or self._geometry
+            if kind in ("ack", "error"):
+                code = "" if kind == "ack" else str(message.get("code", "unknown"))
+                self._replies[int(message["id"])] = Reply(int(message["id"]), code)
+            self._changed.notify_all()
+
+
+class PageDesk:
+    """The pages of one application, by name; one page a name."""
+
+    def __init__(self) -> None:
+        self._pages: dict[str, Page] = {}
+        self._changed = threading.Condition()
+
+    def join(self, name: str, connection: Connection) -> Page | None:
+        """Take a page in; None if there is one of this name already, which keeps working."""
+        with self._changed:
+            present = self._pages.get(name)
+            if present is not None and not present.gone:
+                return None
+            page = self._pages[name] = Page(connection)
+            self._changed.notify_all()
+            return page
+
+    def find(self, name: str, timeout_s: float = 0.0) -> Page | None:
+        """Return the page of a name, waiting for it if need be."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._present(name), timeout_s)
+            return self._present(name)
+
+    def _present(self, name: str) -> Page | None:
+        page = self._pages.get(name)
+        return None if page is None or page.gone else page

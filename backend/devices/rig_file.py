@@ -1,0 +1,193 @@
+"""Rig files: which cameras and which projector make up a rig, in YAML.
+
+::
+
+    cameras:
+      left:  {driver: aravis, address: 192.168.10.2, sensor: {full_well_e: 10500, read_noise_e: 6.5}}
+      right: {driver: aravis, address: 192.168.10.3, sensor: {full_well_e: 10500, read_noise_e: 6.5}}
+    projector: {driver: page, size: 1280x800, refresh_hz: 60, settle_ms: 17}
+
+The first camera is the reference. What a driver needs besides (`address` above) is its own matter.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from backend.devices.assembled import AssembledRig, SensorFacts
+from backend.devices.driver_loading import make_camera, make_projector
+from backend.devices.errors import RigConfigError
+from backend.devices.pages import PageDesk
+from backend.domain.rig import PinholeModel, Pose, RigCalibration
+
+_Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class SensorEntry(_Part):
+    """A camera's data sheet."""
+
+    bit_depth: int = Field(8, ge=8, le=16)
+    black_level_gray: float = Field(0.0, ge=0)
+    full_well_e: float = Field(10_000.0, gt=0)
+    read_noise_e: float = Field(10.0, ge=0)
+
+
+class CameraEntry(BaseModel):
+    """One camera; keys that aren't named here go to its driver."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+    driver: str
+    sensor: SensorEntry = SensorEntry()
+
+
+class ProjectorEntry(BaseModel):
+    """The projector; keys that aren't named here go to its driver."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+    driver: str
+    gamma: float = Field(1.0, gt=0.2, lt=5)
+
+
+class ViewEntry(_Part):
+    """How a calibrated device sees, and where it is."""
+
+    width_px: int = Field(gt=0)
+    height_px: int = Field(gt=0)
+    K: _Matrix
+    distortion: tuple[float, ...] = (0.0,) * 5
+    R: _Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    t_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @field_validator("R")
+    @classmethod
+    def _rotates(cls, value: _Matrix) -> _Matrix:
+        R = np.array(value)
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise ValueError("it is no rotation: its rows have to be orthonormal and right-handed")
+        return value
+
+    @property
+    def model(self) -> PinholeModel:
+        """Intrinsics."""
+        return PinholeModel(
+            self.width_px, self.height_px, np.array(self.K), np.array(self.distortion)
+        )
+
+    @property
+    def device_from_world(self) -> Pose:
+        """Extrinsics."""
+        return Pose(np.array(self.R), np.array(self.t_mm))
+
+
+class CalibrationEntry(_Part):
+    """Where all devices are; the world is the reference camera's frame if its pose is left out."""
+
+    cameras: dict[str, ViewEntry]
+    projector: ViewEntry | None = None
+
+
+class RigFile(_Part):
+    """A rig as its owner describes it."""
+
+    title: str = ""
+    cameras: dict[str, CameraEntry] = Field(min_length=1)
+    projector: ProjectorEntry
+    calibration: CalibrationEntry | None = None
+
+    @classmethod
+    def read(cls, path: Path) -> "RigFile":
+        """Read and check a file.
+
+        Raises
+        ------
+        RigConfigError
+            If it can't be read, isn't YAML, or an entry is unknown, missing or can't be used.
+        """
+        try:
+            document = yaml.safe_load(path.read_text("utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            raise RigConfigError(
+                f"rig file {path} can't be read ({error}); check name and rights"
+            ) from error
+        except yaml.YAMLError as error:
+            raise RigConfigError(
+                f"rig file {path} isn't YAML ({_first_line(error)}); mend that line"
+            ) from error
+        return cls.of(document, str(path))
+
+    @classmethod
+    def of(cls, document: object, name: str) -> "RigFile":
+        """Check a document; `name` is what sentences call it."""
+        try:
+            return cls.model_validate(document)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place = ".".join(map(str, first["loc"])) or "the whole file"
+            problem = first["msg"].removeprefix("Value error, ")
+            raise RigConfigError(
+                f"rig file {name}: {place}: {problem[0].lower() + problem[1:]}; mend it"
+            ) from None
+
+    @model_validator(mode="after")
+    def _no_strangers(self) -> "RigFile":
+        if self.calibration is not None and set(self.calibration.cameras) != set(self.cameras):
+            calibrated, there = sorted(self.calibration.cameras), sorted(self.cameras)
+            raise ValueError(f"its calibration is for cameras {calibrated}, the rig has {there}")
+        return self
+
+
+def assemble(name: str, file: RigFile, desk: PageDesk) -> AssembledRig:
+    """Make a rig of its file; nothing is opened yet.
+
+    Raises
+    ------
+    RigConfigError
+        If a driver is unknown, isn't installed or refuses its options.
+    """
+    cameras = {
+        camera: make_camera(camera, entry.driver, _options(entry))
+        for camera, entry in file.cameras.items()
+    }
+    projector = make_projector("projector", file.projector.driver, _options(file.projector), desk)
+    return AssembledRig(
+        name,
+        cameras,
+        projector,
+        sensors={
+            camera: SensorFacts(**entry.sensor.model_dump())
+            for camera, entry in file.cameras.items()
+        },
+        gamma=file.projector.gamma,
+        calibration=_calibration(file),
+    )
+
+
+def _options(entry: CameraEntry | ProjectorEntry) -> Mapping[str, Any]:
+    return dict(entry.model_extra or {})
+
+
+def _calibration(file: RigFile) -> RigCalibration | None:
+    known = file.calibration
+    if known is None:
+        return None
+    return RigCalibration(
+        cameras={name: view.model for name, view in known.cameras.items()},
+        camera_from_world={name: view.device_from_world for name, view in known.cameras.items()},
+        reference=next(iter(file.cameras)),
+        projector=known.projector.model if known.projector else None,
+        projector_from_world=known.projector.device_from_world if known.projector else None,
+    )
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]

@@ -1,0 +1,97 @@
+"""The rigs of one station: built in, from packages, and the files in its folder."""
+
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from backend.devices.errors import RigConfigError, RigNotFoundError
+from backend.devices.loading import available_rigs, open_rig
+from backend.devices.pages import PageDesk
+from backend.devices.protocols import Rig
+from backend.devices.rig_file import RigFile, assemble
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,40}")
+
+
+@dataclass(frozen=True)
+class KeptRig:
+    """A rig file on the shelf."""
+
+    name: str
+    path: Path
+
+
+class RigShelf:
+    """Rig files in a folder, `NAME.yaml`; read anew each time, so that an edited file counts at once.
+
+    Parameters
+    ----------
+    folder
+        Where they are; made when the first one is added.
+    desk
+        The application's projector pages.
+    """
+
+    def __init__(self, folder: Path, desk: PageDesk) -> None:
+        self._folder = folder
+        self._desk = desk
+
+    def kept(self) -> tuple[KeptRig, ...]:
+        """Return the files, by name."""
+        return tuple(KeptRig(path.stem, path) for path in sorted(self._folder.glob("*.yaml")))
+
+    def open(self, name: str, options: Mapping[str, object]) -> Rig:
+        """Make a rig: of its file if there is one, else by its name.
+
+        Raises
+        ------
+        RigNotFoundError, RigConfigError
+            If there is no such rig, or its file or an option can't be used.
+        """
+        path = self._folder / f"{name}.yaml"
+        if not (_NAME.fullmatch(name) and path.is_file()):
+            return open_rig(name, options)
+        if options:
+            raise RigConfigError(
+                f"rig {name} is described by {path} and takes no options, but got {', '.join(options)}; edit the file"
+            )
+        return assemble(name, RigFile.read(path), self._desk)
+
+    def add(self, source: Path, name: str = "") -> KeptRig:
+        """Check a file and copy it onto the shelf, under its own name or another one.
+
+        Raises
+        ------
+        RigConfigError
+            If it can't be used, or the name is taken or isn't one.
+        """
+        name = name or source.stem
+        if not _NAME.fullmatch(name):
+            raise RigConfigError(
+                f"{name!r} is no name for a rig: use small letters, digits and dashes, e.g. `bench-2`"
+            )
+        if name in {rig.name for rig in available_rigs()} | {rig.name for rig in self.kept()}:
+            raise RigConfigError(
+                f"there is a rig {name!r} already; remove it first, or choose another name"
+            )
+        assemble(name, RigFile.read(source), self._desk)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        target = self._folder / f"{name}.yaml"
+        shutil.copyfile(source, target)
+        return KeptRig(name, target)
+
+    def remove(self, name: str) -> Path:
+        """Take a file off the shelf; it is renamed, not deleted, and returned.
+
+        Raises
+        ------
+        RigNotFoundError
+            If there is none of this name.
+        """
+        path = self._folder / f"{name}.yaml"
+        if not (_NAME.fullmatch(name) and path.is_file()):
+            known = ", ".join(rig.name for rig in self.kept()) or "none"
+            raise RigNotFoundError(f"there is no rig file {name!r}; there are: {known}")
+        return path.rename(path.with_suffix(".yaml.removed"))

@@ -1,0 +1,167 @@
+// The projector page: draws gray patterns pixel by pixel and says when they were submitted to the screen.
+"use strict";
+
+const canvas = document.getElementById("screen");
+const notice = document.getElementById("notice");
+const context = canvas.getContext("2d", { alpha: false, colorSpace: "srgb" });
+const name = new URLSearchParams(location.search).get("name") || "projector";
+
+let device = { width: 0, height: 0 };
+let slots = new Map();
+let awaited = null; // the slot that the next binary message fills
+let socket = null;
+let delay = 100;
+let lock = null;
+
+function geometry() {
+  return {
+    width_px: device.width,
+    height_px: device.height,
+    ratio: devicePixelRatio,
+    scale: visualViewport ? visualViewport.scale : 1,
+    visible: document.visibilityState === "visible",
+    screen_x: screenX,
+    screen_y: screenY,
+    screen: `${screen.width}x${screen.height}${screen.isExtended ? " of several" : ""}`,
+  };
+}
+
+function send(message) {
+  if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+}
+
+function tellGeometry() {
+  if (!device.width) return; // not measured yet
+  send({ t: "geometry", ...geometry() });
+}
+
+function layOut() {
+  canvas.style.width = `${canvas.width / devicePixelRatio}px`;
+  canvas.style.height = `${canvas.height / devicePixelRatio}px`;
+}
+
+function sized(width, height) {
+  if (canvas.width !== width || canvas.height !== height) {
+    canvas.width = width;
+    canvas.height = height;
+  }
+  layOut();
+}
+
+function picture(gray, width, height) {
+  const pixels = new Uint32Array(width * height);
+  for (let i = 0; i < pixels.length; i++) {
+    const v = gray[i];
+    pixels[i] = 0xff000000 | (v << 16) | (v << 8) | v;
+  }
+  return new ImageData(new Uint8ClampedArray(pixels.buffer), width, height);
+}
+
+// After two animation frames the picture was handed to the screen.
+function acknowledge(id) {
+  requestAnimationFrame((drawn) =>
+    requestAnimationFrame((presented) => send({ t: "ack", id, drawn, presented, geometry: geometry() })));
+}
+
+function show(message) {
+  const image = slots.get(message.slot);
+  if (!image) return send({ t: "error", id: message.id, code: "no-slot" });
+  notice.hidden = true;
+  sized(image.width, image.height);
+  context.putImageData(image, 0, 0);
+  acknowledge(message.id);
+}
+
+function blank(message) {
+  notice.hidden = true;
+  sized(message.w, message.h);
+  context.fillStyle = `rgb(${message.level} ${message.level} ${message.level})`;
+  context.fillRect(0, 0, message.w, message.h);
+  acknowledge(message.id);
+}
+
+function receive(event) {
+  if (event.data instanceof ArrayBuffer) {
+    const { slot, w, h } = awaited;
+    slots.set(slot, picture(new Uint8Array(event.data), w, h));
+    awaited = null;
+    return;
+  }
+  const message = JSON.parse(event.data);
+  if (message.t === "load") {
+    if (message.slot === 0) slots = new Map();
+    awaited = message;
+  } else if (message.t === "show") show(message);
+  else if (message.t === "blank") blank(message);
+}
+
+function say(text) {
+  notice.textContent = text;
+  notice.hidden = false;
+}
+
+function connect() {
+  const scheme = location.protocol === "https:" ? "wss" : "ws";
+  socket = new WebSocket(`${scheme}://${location.host}/ws/projector?name=${encodeURIComponent(name)}`);
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => {
+    delay = 100;
+    say(`Projector page “${name}”: ${device.width} × ${device.height} device pixels, waiting for patterns`);
+    tellGeometry();
+  };
+  socket.onmessage = receive;
+  socket.onclose = (event) => {
+    slots = new Map();
+    if (event.code === 4009) return say("Another page is this projector already: close one of them and reload.");
+    say("The connection is lost; connecting again …");
+    setTimeout(connect, delay);
+    delay = Math.min(2 * delay, 5000);
+  };
+}
+
+async function stayAwake() {
+  try {
+    lock = await navigator.wakeLock.request("screen");
+  } catch {
+    lock = null; // refused or unknown: the operating system's own settings decide
+  }
+}
+
+new ResizeObserver((entries) => {
+  const box = entries[0].devicePixelContentBoxSize[0];
+  device = { width: box.inlineSize, height: box.blockSize };
+  layOut();
+  tellGeometry();
+}).observe(document.documentElement, { box: "device-pixel-content-box" });
+
+// A zoom keeps the device pixels but changes their ratio: it is watched by itself.
+(function watchRatio() {
+  matchMedia(`(resolution: ${devicePixelRatio}dppx)`).addEventListener("change", () => {
+    layOut();
+    tellGeometry();
+    watchRatio();
+  }, { once: true });
+})();
+
+// Neither keys nor wheel may zoom what is projected.
+addEventListener("keydown", (event) => {
+  if ((event.ctrlKey || event.metaKey) && ["+", "-", "=", "0"].includes(event.key)) event.preventDefault();
+});
+addEventListener("wheel", (event) => { if (event.ctrlKey) event.preventDefault(); }, { passive: false });
+addEventListener("contextmenu", (event) => event.preventDefault());
+document.addEventListener("visibilitychange", () => {
+  tellGeometry();
+  if (document.visibilityState === "visible") stayAwake();
+});
+// A window that is moved to another screen gets no event of its own.
+let place = "";
+setInterval(() => {
+  const here = `${screenX} ${screenY} ${screen.width} ${screen.height}`;
+  if (here !== place) {
+    place = here;
+    tellGeometry();
+  }
+}, 250);
+
+stayAwake();
+connect();
