@@ -61,7 +61,7 @@ def curvature(
 
 def smoothed(values: Float[np.ndarray, "h w"], *, sigma_px: float) -> Float64[np.ndarray, "h w"]:
     """Smooth a map by planes fitted to each pixel's surroundings, without bending it at the mask's edges."""
-    return _Planes(np.isfinite(values), sigma_px).smooth(values)
+    return _Planes(np.isfinite(values), sigma_px).smooth(values.astype(np.float64))
 
 
 class _Planes:
