@@ -1,50 +1,16 @@
-"""Which projector pixels nobody has claimed yet, where pixels that weren't told may look: lit alone, they can be told."""
+"""Light a few epipolar lines at a time, where pixels may look that get light from other places, too."""
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int32
 
 from backend.numerics.camera_model import project, rays
 from backend.numerics.code_certainty import PairGeometry
-from backend.numerics.intensity_mask import scatter
 
 _MOST_PIXELS = 8000
 _STEP_PX = 1.5
-
-
-def claimed_places(
-    projector_px: Float32[np.ndarray, "h w"],
-    projector_row_px: Float32[np.ndarray, "h w"],
-    *,
-    width_px: int,
-    height_px: int,
-    reach_px: int = 1,
-) -> Bool[np.ndarray, "hp wp"]:
-    """Mark the projector pixels that a camera's trusted codes claim, and those between them.
-
-    Parameters
-    ----------
-    projector_px, projector_row_px
-        Trusted codes; NaN elsewhere.
-    width_px, height_px
-        Size of the projector.
-    reach_px
-        Gaps between claimed pixels up to twice this are closed: a camera samples a steep surface thinly.
-
-    Examples
-    --------
-    >>> places = claimed_places(np.float32([[2, 4]]), np.float32([[0, 0]]), width_px=8, height_px=1)
-    >>> places.astype(int)
-    array([[0, 0, 1, 1, 1, 0, 0, 0]])
-    """
-    free = np.ones((height_px, width_px), np.float32)
-    scatter(np.zeros_like(projector_px), projector_px, projector_row_px, into=free)
-    side = 2 * reach_px + 1
-    box = np.ones((side, side), np.uint8)
-    claimed = cv2.morphologyEx(
-        (free == 0).astype(np.uint8), cv2.MORPH_CLOSE, box, borderType=cv2.BORDER_CONSTANT
-    )
-    return np.asarray(claimed > 0)
 
 
 def possible_places(
@@ -86,15 +52,55 @@ def possible_places(
     return np.asarray(cv2.dilate(places, np.ones((5, 5), np.uint8)) > 0)
 
 
-def without_specks(places: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Drop places narrower than two pixels: gaps of the sampling, no surface that stayed unseen.
+class Looks(NamedTuple):
+    """Epipolar lines in narrow bands, every so many of which are lit in one look."""
+
+    width_px: float
+    """Of a band."""
+    number: int
+    """Looks: each lights one band of that many."""
+
+    def own(self, lines_px: Float32[np.ndarray, "*shape"]) -> Int32[np.ndarray, "*shape"]:
+        """Return the look in which each line is in the middle of what is lit.
+
+        Examples
+        --------
+        >>> Looks(10.0, 3).own(np.float32([0, 9, 10, 35])).tolist()
+        [0, 0, 1, 0]
+        """
+        band = np.floor(np.nan_to_num(lines_px) / np.float32(self.width_px))
+        return np.asarray(band.astype(np.int32) % self.number, np.int32)
+
+    def lit(
+        self, lines_px: Float32[np.ndarray, "*shape"], look: int, margin_px: float
+    ) -> Bool[np.ndarray, "*shape"]:
+        """Tell which lines a look lights: its bands and a margin on either side, where blur would dim them."""
+        places = (lines_px, lines_px - np.float32(margin_px), lines_px + np.float32(margin_px))
+        return np.asarray(np.logical_or.reduce([self.own(p) == look for p in places]))
+
+
+def second_light(
+    white: Float32[np.ndarray, "h w"],
+    alone: Float32[np.ndarray, "h w"],
+    black: Float32[np.ndarray, "h w"],
+    *,
+    noise_gray: float,
+) -> Float32[np.ndarray, "h w"]:
+    """Return the share of a pixel's light that comes from other epipolar lines than its own.
+
+    Parameters
+    ----------
+    white, alone, black
+        Gray levels under the white field, under its own lines alone, and under the black field, in [gray].
+    noise_gray
+        Differences up to this are none, in [gray].
 
     Examples
     --------
-    >>> places = np.zeros((4, 6), bool)
-    >>> places[:, 1], places[1:3, 3:5] = True, True
-    >>> without_specks(places).sum().item()
-    4
+    >>> gray = [np.float32([[value]]) for value in (104, 54, 4)]
+    >>> second_light(*gray, noise_gray=3).item()
+    0.5
     """
-    opened = cv2.morphologyEx(places.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    return np.asarray(opened > 0)
+    light = white - black
+    other = np.where(white - alone > np.float32(noise_gray), white - alone, np.float32(0))
+    return np.asarray(other / np.maximum(light, np.float32(noise_gray)), np.float32)

@@ -1,39 +1,43 @@
-"""A second look at pixels that see two places at once: with everything told already left dark, they see one."""
+"""A second look at pixels that get light from two places at once: a few epipolar lines are lit at a time."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 
 from backend.domain.checks import Check
 from backend.domain.frames import Frame, InMemory
 from backend.domain.hints import Frames, Mask, Picture, Value
 from backend.domain.params import setting
-from backend.domain.patterns import WHITE, Pattern
+from backend.domain.patterns import WHITE, Gray, Pattern, Stripe
 from backend.domain.rig import RigCalibration, RigFacts
-from backend.domain.shots import Plan, Shoot, Shot
+from backend.domain.shots import Burst, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Level, Review
 from backend.numerics.code_certainty import PairGeometry, on_epipolar_line
-from backend.numerics.second_look import claimed_places, possible_places, without_specks
-from backend.numerics.triangulation import triangulate_projector
+from backend.numerics.epipolar_bands import EpipolarLines, epipolar_lines
+from backend.numerics.errors import CalibrationError
+from backend.numerics.second_look import Looks, possible_places, second_light
+from backend.numerics.triangulation import projector_consistency, triangulate_projector
 from backend.stages.base_exposure import BaseExposure
 from backend.stages.code_frames import CodeFrames, code_frames
-from backend.stages.code_map import require_projector
+from backend.stages.code_joining import join
+from backend.stages.code_map import least_contrast_gray, require_projector
 from backend.stages.edges import Codes, EdgesParams, edges
 from backend.stages.intensity_mask import IntensityMask
-from backend.stages.pixel_response import saturation_gray
 from backend.stages.rig_geometry import camera_geometry
 
 _DEPTH_MARGIN_MM = 15.0
 _SURE = 0.005
 """Share of the told pixels at either end of their depths that is left out of the range."""
-_DIMMED = 0.5
-_TOLD, _UNTOLD, _TOLD_NOW = 1, 2, 3
+_MARGIN_PX = 3.0
+"""By which lit bands are wider than the lines that they are for."""
+_UNTOLD, _SECOND_LIGHT, _TOLD_NOW = 1, 2, 3
 LABELS = {
     _UNTOLD: "no code that agrees with the calibration, or none at all",
+    _SECOND_LIGHT: "much of its light comes from other places",
     _TOLD_NOW: "told by the second look",
 }
 
@@ -42,36 +46,46 @@ class SecondLookParams(EdgesParams):
     """When a second look is taken, and how."""
 
     run: Literal["auto", "yes", "no"] = setting("auto", title="Second look")
-    """Auto: under a refined mask, if more lit pixels than allowed have no code that agrees with the calibration."""
-    few: float = setting(0.001, title="Untold pixels allowed", ge=0, le=1)
-    """Share of the lit pixels that may stay untold without a second look."""
+    """Auto: under a refined mask, if more of the lit pixels than allowed get light from two places."""
+    few: float = setting(0.002, title="Such pixels allowed", ge=0, le=1)
+    """Share of the lit pixels that may stay untold, or lit from two places, without a second look."""
+    second_light: float = setting(0.06, title="Light from other places", ge=0.01, le=1)
+    """Share of its light from which a pixel is looked at again: it moves stripe edges."""
     epipolar_px: float = setting(2.5, title="Row against epipolar line", unit="px", gt=0, le=1000)
     """A code that misses its epipolar line by more came by a second reflection."""
-    trims: int = setting(4, title="Trims", ge=0, le=8, advanced=True)
-    """So many times the light is halved where a pixel that matters saturates."""
+    bands: int = setting(8, title="Looks", ge=2, le=32)
+    """Each lights one of so many bands of epipolar lines, and takes a picture of every column pattern."""
+    band_px: float = setting(10.0, title="Width of a band", unit="px", ge=2, le=200)
+    """In projector pixels. Narrow bands part places that are near each other, as in a corner."""
 
 
 @dataclass(frozen=True)
 class SecondLook:
-    """The same code once more, shown only where nobody looked so far."""
+    """The columns' code once more, on a few epipolar lines at a time."""
 
-    factor: Annotated[Float32[np.ndarray, "h w"], Picture("Second mask", low=0.0, high=1.0)]
-    """Light per projector pixel; 0 where the first look told everything."""
-    untold: Annotated[Mapping[str, UInt8[np.ndarray, "_h _w"]], Mask("Untold pixels", LABELS)]
-    untold_before: Annotated[float, Value("Lit pixels without a trusted code, before")]
-    untold_after: Annotated[float, Value("After the second look")]
+    marked: Annotated[
+        Mapping[str, UInt8[np.ndarray, "_h _w"]], Mask("Light from two places", LABELS)
+    ]
+    second_light: Annotated[
+        Mapping[str, Float32[np.ndarray, "_h _w"]],
+        Picture("Light from other places", low=0.0, high=1.0, colormap="inferno"),
+    ]
+    """Share of each pixel's light that doesn't come along its own epipolar lines."""
+    before: Annotated[float, Value("Lit pixels untold or lit from two places")]
+    after: Annotated[float, Value("After the second look")]
+    looks: Annotated[int, Value("Looks taken")] = 0
     codes: Codes | None = None
-    """What the second look tells, everywhere; None: none was taken."""
+    """What the second look tells, where it was taken; None: it wasn't."""
     trusted: Mapping[str, Bool[np.ndarray, "_h _w"]] = field(default_factory=dict)
     """Pixels whose second code is to be used."""
     frames: Annotated[tuple[Frame, ...], Frames("Code of the second look")] = ()
 
 
 def _told(result: SecondLook, params: SecondLookParams) -> Check:
-    sentence = f"{result.untold_before:.2%} of the lit pixels had no trusted code"
+    sentence = f"{result.before:.2%} of the lit pixels are untold or lit from two places"
     if result.codes is not None:
-        sentence += f", {result.untold_after:.2%} after a second look"
-    return Check("untold", Level.OK, sentence, result.untold_after, params.few)
+        sentence += f", {result.after:.2%} after a second look"
+    return Check("told", Level.OK, sentence, result.after, params.few)
 
 
 @stage(title="Second look", version=1, review=Review.ON_WARNING, checks=(_told,))
@@ -86,8 +100,17 @@ def second_look(
     shoot: Shoot,
 ) -> SecondLook:
     """Show the code once more only where nobody looked: second reflections from bright places can't outshine it."""
-    look = _Look(codes, frames, base, facts, calibration, params)
-    return shoot(look.plan(_allowed(mask, params)))
+    if not _allowed(mask, params) or mask is None:
+        return _NOTHING
+    try:
+        look = _Look(codes, frames, mask, base, facts, calibration, params)
+    except CalibrationError:
+        # Camera and projector above each other: their lines run along the columns, and bands can't part places.
+        return _NOTHING
+    return shoot(look.plan()) if look.possible else _NOTHING
+
+
+_NOTHING = SecondLook({}, {}, float("nan"), float("nan"))
 
 
 def _allowed(mask: IntensityMask | None, params: SecondLookParams) -> bool:
@@ -96,150 +119,186 @@ def _allowed(mask: IntensityMask | None, params: SecondLookParams) -> bool:
     return params.run == "yes"
 
 
-def trusted_codes(
-    codes: Codes, geometry: Mapping[str, PairGeometry], epipolar_px: float
-) -> dict[str, Bool[np.ndarray, "_h _w"]]:
-    """Tell, per camera, which codes are valid and agree with the calibration."""
-    return {
-        name: (codes.reasons[name] == 0)
-        & on_epipolar_line(
-            codes.projector_px[name], codes.projector_row_px[name], pair, tolerance_px=epipolar_px
-        )
-        for name, pair in geometry.items()
-    }
-
-
 class _Look:
-    """Everything that the plan of a second look needs."""
+    """Everything that the plan of a second look needs: it is taken with the reference camera."""
 
     def __init__(
         self,
         codes: Codes,
         frames: CodeFrames,
+        mask: IntensityMask,
         base: BaseExposure,
         facts: RigFacts,
         calibration: RigCalibration | None,
         params: SecondLookParams,
     ) -> None:
-        self.codes, self.frames, self.base, self.facts = codes, frames, base, facts
+        self.name = facts.reference
+        self.codes, self.mask, self.base, self.facts = codes, mask, base, facts
         self.params = params
         self.projector = require_projector(facts)
-        self.cameras = tuple(n for n in codes.projector_px if n in codes.projector_row_px)
-        self.geometry = camera_geometry(calibration, self.cameras)
-        self.trusted = trusted_codes(codes, self.geometry, params.epipolar_px)
-        self.untold = {n: base.lit[n] & ~told for n, told in self.trusted.items()}
-
-    def plan(self, allowed: bool) -> Plan[SecondLook]:
-        """Light what nobody claimed, dim it where it dazzles, and capture the code."""
-        places = self._places() if allowed and self._share(self.untold) > self.params.few else None
-        if places is None or not places.any():
-            return self._nothing()
-        factor = places.astype(np.float32)
-        for _ in range(self.params.trims):
-            (white,) = yield (self._shot(WHITE, factor),)
-            dazzled = {
-                n: untold & (white[n].gray >= saturation_gray(self.facts, n))
-                for n, untold in self.untold.items()
-            }
-            if not any(d.any() for d in dazzled.values()):
-                break
-            factor = np.where(self._possible(dazzled), factor * np.float32(_DIMMED), factor)
-        exposed = yield tuple(self._shot(p, factor) for p in self._patterns())
-        found = code_frames(tuple(frame for shot in exposed for frame in shot.values()))
-        return self._result(factor, found)
-
-    def _nothing(self) -> SecondLook:
-        share = self._share(self.untold)
-        return SecondLook(
-            np.zeros((self.projector.height_px, self.projector.width_px), np.float32),
-            {n: np.where(u, np.uint8(_UNTOLD), np.uint8(0)) for n, u in self.untold.items()},
-            share,
-            share,
+        pair = camera_geometry(calibration, (self.name,)).get(self.name)
+        self.patterns = _column_patterns(frames)
+        self.possible = (
+            pair is not None
+            and bool(self.patterns)
+            and self.name in codes.projector_row_px
+            and self.name in codes.projector_px
         )
+        if pair is None or not self.possible:
+            return
+        self.pair: PairGeometry = pair
+        self.lines: EpipolarLines = epipolar_lines(*pair)
+        self.looks = Looks(params.band_px, params.bands)
+        self.own: Int32[np.ndarray, "h w"] = self.looks.own(self.lines.camera_px)
+        self.told = (codes.reasons[self.name] == 0) & on_epipolar_line(
+            codes.projector_px[self.name],
+            codes.projector_row_px[self.name],
+            pair,
+            tolerance_px=params.epipolar_px,
+        )
+
+    def plan(self) -> Plan[SecondLook]:
+        """See who gets light from elsewhere, then code the lines of those, some at a time."""
+        whites = yield self._whites()
+        grays = [shot[self.name].gray.astype(np.float32) for shot in whites]
+        elsewhere = self._second_light(grays)
+        lit = self.base.lit[self.name]
+        wanted = lit & (~self.told | (elsewhere > self.params.second_light))
+        if int(np.count_nonzero(wanted)) <= self.params.few * max(1, int(np.count_nonzero(lit))):
+            return self._result(elsewhere, wanted, [], ())
+        found: list[_Told] = []
+        kept: list[Frame] = []
+        depths_mm = self._depths_mm()
+        for number in range(self.params.bands):
+            pixels = wanted & (self.own == number)
+            factor = self._factor(number, pixels, depths_mm)
+            if not factor.any():
+                continue
+            exposed = yield tuple(self._shot(pattern, factor) for pattern in self.patterns)
+            frames = code_frames(tuple(shot[self.name] for shot in exposed))
+            codes = edges(frames, IntensityMask(factor), self.facts, self.params, _silent)
+            found.append(self._told_now(codes, pixels, depths_mm))
+            kept += frames.frames
+        return self._result(elsewhere, wanted, found, tuple(kept))
+
+    # what is captured
 
     def _shot(self, pattern: Pattern, factor: Float32[np.ndarray, "h w"]) -> Shot:
         return Shot(
             pattern,
             self.base.exposure_ms,
             self.base.gain_db,
-            self.cameras,
+            (self.name,),
             role="second look",
             mask=InMemory(factor),
         )
 
-    def _patterns(self) -> tuple[Pattern, ...]:
-        """Return the patterns of the first look in their order."""
-        first = self.frames.frames[0].camera
-        return tuple(f.pattern for f in self.frames.frames if f.camera == first)
+    def _whites(self) -> Burst:
+        """Return the white field under the mask: all of it, then each look's lines."""
+        factor = np.asarray(self.mask.factor, np.float32)
+        parts = [
+            np.where(self.looks.lit(self.lines.projector_px, n, _MARGIN_PX), factor, np.float32(0))
+            for n in range(self.params.bands)
+        ]
+        return tuple(self._shot(WHITE, part) for part in (factor, *parts))
 
-    def _places(self) -> Bool[np.ndarray, "h w"]:
-        """Mark what is possible for an untold pixel and claimed by no told one."""
-        claimed = np.zeros((self.projector.height_px, self.projector.width_px), bool)
-        nan = np.float32(np.nan)
-        for name, told in self.trusted.items():
-            claimed |= claimed_places(
-                np.where(told, self.codes.projector_px[name], nan),
-                np.where(told, self.codes.projector_row_px[name], nan),
-                width_px=self.projector.width_px,
-                height_px=self.projector.height_px,
-            )
-        return without_specks(self._possible(self.untold) & ~claimed)
+    def _second_light(self, grays: list[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, "h w"]:
+        alone = np.select([self.own == n for n in range(self.params.bands)], grays[1:])
+        noise_gray = least_contrast_gray(self.facts.cameras[self.name])
+        black = self.base.black[self.name].astype(np.float32)
+        return second_light(grays[0], alone.astype(np.float32), black, noise_gray=noise_gray)
 
-    def _possible(self, pixels: Mapping[str, Bool[np.ndarray, "_h _w"]]) -> Bool[np.ndarray, "h w"]:
-        places = np.zeros((self.projector.height_px, self.projector.width_px), bool)
-        for name, wanted in pixels.items():
-            near_mm, far_mm = self._depths_mm(name)
-            if near_mm < far_mm:
-                places |= possible_places(
-                    wanted, self.geometry[name], near_mm=near_mm, far_mm=far_mm
-                )
-        return places
-
-    def _depths_mm(self, name: str) -> tuple[float, float]:
+    def _depths_mm(self) -> tuple[float, float]:
         """Return between which depths surfaces are: those of the pixels told, and a little more."""
-        pair = self.geometry[name]
-        points_mm = triangulate_projector(self.codes.projector_px[name], *pair).points_mm
-        depth_mm = points_mm[self.trusted[name], 2]
+        points_mm = triangulate_projector(self.codes.projector_px[self.name], *self.pair).points_mm
+        depth_mm = points_mm[self.told, 2]
         if not depth_mm.size:
             return 0.0, 0.0
         near, far = np.quantile(depth_mm[:: max(1, depth_mm.size // 100_000)], [_SURE, 1 - _SURE])
         return max(1.0, float(near) - _DEPTH_MARGIN_MM), float(far) + _DEPTH_MARGIN_MM
 
-    def _share(self, pixels: Mapping[str, Bool[np.ndarray, "_h _w"]]) -> float:
-        lit = sum(int(np.count_nonzero(self.base.lit[n])) for n in pixels)
-        return sum(int(np.count_nonzero(p)) for p in pixels.values()) / max(1, lit)
+    def _factor(
+        self, number: int, pixels: Bool[np.ndarray, "h w"], depths_mm: tuple[float, float]
+    ) -> Float32[np.ndarray, "hp wp"]:
+        """Light a look's lines, but only as far as its pixels may look: less light, fewer reflections."""
+        near_mm, far_mm = depths_mm
+        lit = self.looks.lit(self.lines.projector_px, number, _MARGIN_PX)
+        if not pixels.any() or near_mm >= far_mm:
+            return np.zeros(lit.shape, np.float32)
+        places = possible_places(pixels, self.pair, near_mm=near_mm, far_mm=far_mm)
+        return np.where(lit & places, self.mask.factor, 0).astype(np.float32)
 
-    def _result(self, factor: Float32[np.ndarray, "h w"], found: CodeFrames) -> SecondLook:
-        codes = edges(found, IntensityMask(factor), self.facts, self.params, _silent)
-        again = trusted_codes(codes, self.geometry, self.params.epipolar_px)
-        trusted = {n: again[n] & self.untold[n] & _lit_places(codes, n, factor) for n in again}
-        left = {n: u & ~trusted[n] for n, u in self.untold.items()}
+    # what is told
+
+    def _told_now(
+        self, codes: Codes, pixels: Bool[np.ndarray, "h w"], depths_mm: tuple[float, float]
+    ) -> "_Told":
+        columns = codes.projector_px[self.name]
+        points_mm = triangulate_projector(columns, *self.pair).points_mm
+        with np.errstate(invalid="ignore"):
+            inside = (points_mm[..., 2] >= depths_mm[0]) & (points_mm[..., 2] <= depths_mm[1])
+        # The row wasn't coded: the lines that are lit tell it. The residual against row 0 is the row.
+        rows = projector_consistency(
+            points_mm,
+            np.zeros_like(columns),
+            self.pair.projector,
+            self.pair.projector_from_camera,
+            rows=True,
+        )
+        return _Told(codes, pixels & (codes.reasons[self.name] == 0) & inside, rows)
+
+    def _result(
+        self,
+        elsewhere: Float32[np.ndarray, "h w"],
+        wanted: Bool[np.ndarray, "h w"],
+        found: list["_Told"],
+        frames: tuple[Frame, ...],
+    ) -> SecondLook:
+        told_now = np.zeros(wanted.shape, bool)
+        for told in found:
+            told_now |= told.use
+        marked = np.zeros(wanted.shape, np.uint8)
+        marked[wanted] = _UNTOLD
+        marked[wanted & self.told] = _SECOND_LIGHT
+        marked[told_now] = _TOLD_NOW
+        lit = max(1, int(np.count_nonzero(self.base.lit[self.name])))
         return SecondLook(
-            factor,
-            {
-                n: np.where(
-                    trusted[n], np.uint8(_TOLD_NOW), np.where(u, np.uint8(_UNTOLD), np.uint8(0))
-                )
-                for n, u in left.items()
-            },
-            self._share(self.untold),
-            self._share(left),
-            codes,
-            trusted,
-            found.frames,
+            {self.name: marked},
+            {self.name: elsewhere},
+            int(np.count_nonzero(wanted)) / lit,
+            int(np.count_nonzero(wanted & ~told_now)) / lit,
+            len(found),
+            _merged(self.name, found) if found else None,
+            {self.name: told_now} if found else {},
+            frames,
         )
 
 
-def _lit_places(
-    codes: Codes, name: str, factor: Float32[np.ndarray, "hp wp"]
-) -> Bool[np.ndarray, "h w"]:
-    """Tell which pixels' codes are places that were lit at all: others are read from scattered light."""
-    columns, rows = (
-        np.nan_to_num(m[name] + np.float32(0.5)).astype(np.intp)
-        for m in (codes.projector_px, codes.projector_row_px)
+@dataclass(frozen=True)
+class _Told:
+    """What one look tells."""
+
+    codes: Codes
+    use: Bool[np.ndarray, "h w"]
+    row_px: Float32[np.ndarray, "h w"]
+
+
+def _column_patterns(frames: CodeFrames) -> tuple[Pattern, ...]:
+    """Return the first look's patterns of columns, in their order."""
+    first = frames.frames[0].camera
+    return tuple(
+        f.pattern
+        for f in frames.frames
+        if f.camera == first and isinstance(f.pattern, Gray | Stripe) and f.pattern.axis == "x"
     )
-    height, width = factor.shape
-    return np.asarray(factor[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)] > 0)
+
+
+def _merged(name: str, found: list[_Told]) -> Codes:
+    """Put together what the looks tell, each about its own pixels."""
+    first, *others = (replace(t.codes, projector_row_px={name: t.row_px}) for t in found)
+    for codes, told in zip(others, found[1:], strict=True):
+        first = join(first, codes, {name: told.use})
+    return first
 
 
 def _silent(done: float, text: str = "") -> None:
