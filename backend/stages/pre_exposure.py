@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Integer
 
 from backend.domain.checks import Check, at_least, at_most
 from backend.domain.errors import StageFailedError
-from backend.domain.frames import Frame
+from backend.domain.frames import Frame, InMemory
 from backend.domain.hints import Histogram, Mask, Picture, Table, Value
 from backend.domain.params import Params, setting
 from backend.domain.patterns import BLACK, WHITE
@@ -20,6 +20,7 @@ from backend.domain.shots import Exposed, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Review
 from backend.numerics.histogram import dark_level, pooled_histogram
+from backend.stages.intensity_mask import IntensityMask
 
 MAX_CAPTURES = 10
 
@@ -104,10 +105,12 @@ def _unsaturated(preview: Preview, params: PreExposureParams) -> Check:
 
 
 @stage(title="Preview", version=1, review=Review.ON_WARNING, checks=(_lit, _unsaturated))
-def pre_exposure(facts: RigFacts, params: PreExposureParams, shoot: Shoot) -> Preview:
+def pre_exposure(
+    facts: RigFacts, mask: IntensityMask | None, params: PreExposureParams, shoot: Shoot
+) -> Preview:
     """Find the longest exposure at which the white field saturates no lit pixel in any camera."""
     grid = ExposureGrid.of(facts, snap=params.snap)
-    search = shoot(search_plan(facts, params, grid))
+    search = shoot(search_plan(facts, params, grid, mask))
     return _summarise(search, facts)
 
 
@@ -152,9 +155,15 @@ class Search:
     dark: Exposed
 
 
-def search_plan(facts: RigFacts, params: PreExposureParams, grid: ExposureGrid) -> Plan[Search]:
+def search_plan(
+    facts: RigFacts,
+    params: PreExposureParams,
+    grid: ExposureGrid,
+    mask: IntensityMask | None = None,
+) -> Plan[Search]:
     """Bracket and bisect on the grid, then one long white field and the black field."""
-    take = partial(Shot, WHITE, role="white")
+    pixels = InMemory(mask.factor) if mask is not None else None
+    take = partial(Shot, WHITE, role="white", mask=pixels)
     whites: list[Exposed] = []
     if params.exposure_ms is not None:
         whites += yield (take(_allowed(params.exposure_ms, facts)),)

@@ -44,7 +44,7 @@ class LinearCamera:
 @pytest.mark.parametrize("brightest", [0.13, 0.9, 4.0, 11.0, 25.0])
 def test_the_longest_unsaturated_multiple_of_the_frame_period_is_found(brightest):
     camera = LinearCamera(brightest)
-    preview = pre_exposure(rig(), PreExposureParams(saturated_share=0.0), camera.shoot)
+    preview = pre_exposure(rig(), None, PreExposureParams(saturated_share=0.0), camera.shoot)
     steps = preview.t_pre_ms / PERIOD_MS
     assert steps == pytest.approx(round(steps))
     assert 4 + brightest * preview.t_pre_ms < 254.5
@@ -55,7 +55,7 @@ def test_the_longest_unsaturated_multiple_of_the_frame_period_is_found(brightest
 
 def test_brightness_is_measured_from_the_longest_unsaturated_picture():
     camera = LinearCamera(4.0)
-    preview = pre_exposure(rig(), PreExposureParams(), camera.shoot)
+    preview = pre_exposure(rig(), None, PreExposureParams(), camera.shoot)
     lit = preview.foreground["left"]
     error = preview.rate_gray_per_ms["left"][lit] - camera.rate[lit]
     longest = max(t for role, t in camera.shots if role == "white")
@@ -67,18 +67,20 @@ def test_brightness_is_measured_from_the_longest_unsaturated_picture():
 
 def test_a_set_exposure_is_used_as_it_is():
     camera = LinearCamera(1.0)
-    preview = pre_exposure(rig(), PreExposureParams(exposure_ms=33.3, boost=1.0), camera.shoot)
+    preview = pre_exposure(
+        rig(), None, PreExposureParams(exposure_ms=33.3, boost=1.0), camera.shoot
+    )
     assert preview.t_pre_ms == 33.3
     assert camera.shots == [("white", 33.3), ("dark", 33.3)]
 
 
 def test_an_all_black_scene_is_refused_in_a_sentence():
     with pytest.raises(StageFailedError, match="lens cap"):
-        pre_exposure(rig(), PreExposureParams(), LinearCamera(0.0).shoot)
+        pre_exposure(rig(), None, PreExposureParams(), LinearCamera(0.0).shoot)
 
 
 def test_an_all_white_scene_gives_the_shortest_exposure_and_a_failed_check():
-    preview = pre_exposure(rig(), PreExposureParams(), LinearCamera(5000.0).shoot)
+    preview = pre_exposure(rig(), None, PreExposureParams(), LinearCamera(5000.0).shoot)
     assert preview.t_pre_ms == pytest.approx(PERIOD_MS)
     assert preview.saturated_share > 0.9
     levels = {c.name: c.level.value for c in pre_exposure.check(preview, PreExposureParams())}
@@ -94,4 +96,4 @@ def test_an_all_white_scene_gives_the_shortest_exposure_and_a_failed_check():
 )
 def test_impossible_exposures_are_refused(facts, params, words):
     with pytest.raises(StageFailedError, match=words):
-        pre_exposure(facts, params, LinearCamera(1.0).shoot)
+        pre_exposure(facts, None, params, LinearCamera(1.0).shoot)

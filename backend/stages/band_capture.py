@@ -1,0 +1,285 @@
+"""Capture fringes again with part of the epipolar lines lit at a time, where second reflections spoilt the first ones."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from backend.domain.checks import Check
+from backend.domain.errors import StageFailedError
+from backend.domain.frames import Frame, InMemory
+from backend.domain.hints import Frames, Value
+from backend.domain.params import Params, setting
+from backend.domain.patterns import Pattern
+from backend.domain.rig import RigCalibration, RigFacts
+from backend.domain.shots import Plan, Shoot, Shot
+from backend.domain.stage import stage
+from backend.domain.states import Level, Review
+from backend.numerics.camera_model import compose, inverse
+from backend.numerics.epipolar_bands import Bands, EpipolarLines, bands_around, epipolar_lines
+from backend.stages.cloud import Cloud
+from backend.stages.exposures import Exposures
+from backend.stages.fringe_phase import AbsolutePhase
+from backend.stages.intensity_mask import IntensityMask
+from backend.stages.pre_exposure import ExposureGrid
+from backend.stages.rig_geometry import (
+    from_reference,
+    pinhole,
+    projector_from_reference,
+    require_camera,
+)
+
+_NO_EXPOSURE = 255
+_SAMPLE = 2000
+
+
+class BandCaptureParams(Params):
+    """Whether and how finely the projector's lines are told apart."""
+
+    run: Literal["auto", "yes", "no"] = setting("auto", title="Light bands")
+    """Auto: if more pixels than allowed have a phase but no point."""
+    enough: float = setting(0.01, title="Doubtful pixels allowed", ge=0, le=1)
+    """Share of the pixels with a phase that may have no point before bands are lit."""
+    bits: int = setting(5, title="Bits of the bands' numbers", ge=1, le=8)
+    """2^bits bands; each bit takes two sets of fringes per camera, one with the bands whose bit is 1, one
+    with the others. More bits separate reflections from nearer places."""
+    budget_s: float = setting(30.0, title="Time budget", unit="s", gt=0, le=3600)
+    """Light time of all fringes under bands."""
+    exposures_ms: tuple[float, ...] | None = setting(
+        None, title="Exposures", unit="ms", auto="exposures_ms", min_length=1, max_length=8
+    )
+    """Automatic: the one of the first fringes that serves most of the doubtful pixels, or as long as the time
+    budget allows."""
+    snap: bool = setting(True, title="Whole projector frames", advanced=True)
+    """Use multiples of the projector's frame period, so that its modulation averages out."""
+    gain_db: float = setting(0.0, title="Camera gain", unit="dB", ge=0, le=48)
+    cameras: Literal["all", "reference"] = setting("all", title="Cameras", advanced=True)
+    """Every camera has epipolar lines of its own, and so takes as many fringes again."""
+
+
+@dataclass(frozen=True)
+class BandSet:
+    """Which lines of a camera were lit in one set of fringes."""
+
+    camera: str
+    bit: int
+    inverse: bool
+    first: int
+    """Its first frame."""
+    count: int
+
+
+@dataclass(frozen=True)
+class BandFrames:
+    """Fringes under bands of epipolar lines, of one camera after the other."""
+
+    frames: Annotated[tuple[Frame, ...], Frames("Fringes under bands")]
+    sets: tuple[BandSet, ...]
+    """Empty if bands weren't needed."""
+    low_px: Mapping[str, float]
+    """Per camera, where the first band begins, see `numerics.epipolar_bands`."""
+    width_px: Mapping[str, float]
+    bits: int
+    exposure_index: tuple[int, ...]
+    """Which of the first fringes' exposures those of the bands are, shortest first; 255: none of them."""
+    exposures_ms: tuple[float, ...]
+    frame_count: Annotated[int, Value("Frames")]
+    exposure_time_s: Annotated[float, Value("Exposure time in all", unit="s")]
+    """Of all frames: cameras take turns."""
+    doubtful_share: Annotated[float, Value("Pixels with a phase but no point")]
+
+    def bands(self, camera: str) -> Bands:
+        """Return a camera's bands."""
+        return Bands(self.low_px[camera], self.width_px[camera], self.bits)
+
+
+def _complete(result: BandFrames, params: BandCaptureParams) -> Check:
+    if not result.sets:
+        sentence = f"no bands: {result.doubtful_share:.2%} of the pixels with a phase have no point"
+    else:
+        sentence = f"{result.frame_count} frames under {2**result.bits} bands captured"
+    return Check("bands", Level.OK, sentence, float(result.frame_count))
+
+
+@stage(title="Bands", version=1, review=Review.ON_WARNING, checks=(_complete,))
+def band_capture(
+    phase: AbsolutePhase,
+    cloud: Cloud,
+    exposures: Exposures,
+    mask: IntensityMask | None,
+    calibration: RigCalibration,
+    facts: RigFacts,
+    params: BandCaptureParams,
+    shoot: Shoot,
+) -> BandFrames:
+    """Light part of the epipolar lines at a time where points contradict: reflections from other lines are dark."""
+    doubtful = doubtful_pixels(phase, cloud)
+    with_phase = int(np.count_nonzero(np.isfinite(_coordinate(phase, calibration.reference))))
+    share = float(np.count_nonzero(doubtful)) / max(1, with_phase)
+    if params.run == "no" or (params.run == "auto" and share <= params.enough):
+        return _no_bands(params.bits, share)
+    if facts.projector is None:
+        raise StageFailedError("The rig has no projector: fringes need one.")
+    if not doubtful.any():
+        raise StageFailedError(
+            "Every pixel with a phase has a point: there is nothing that bands could clear up."
+        )
+    others = [n for n in phase.projector_px if n != calibration.reference]
+    names = [calibration.reference, *(others if params.cameras == "all" else [])]
+    bands = {name: _bands(name, phase, doubtful, calibration, params.bits) for name in names}
+    factor = np.ones((1, 1), np.float32) if mask is None else mask.factor.astype(np.float32)
+    masks = _Masks(factor, {name: lines(calibration, name) for name in names}, bands)
+    patterns = exposures.design.patterns(facts.projector)
+    frames = 2 * params.bits * len(names) * len(patterns)
+    times_ms = tuple(sorted(params.exposures_ms or ())) or (
+        _exposure_ms(phase, exposures, doubtful, facts, params, frames=frames),
+    )
+    numbers = tuple(_number(t, exposures.exposures_ms) for t in times_ms)
+    return shoot(capture_plan(patterns, times_ms, masks, numbers, params, share))
+
+
+def doubtful_pixels(phase: AbsolutePhase, cloud: Cloud) -> Bool[np.ndarray, "h w"]:
+    """Mark the reference camera's pixels that have a phase but no point."""
+    name = cloud.cameras[0] if cloud.cameras else next(iter(cloud.depth_mm))
+    return np.asarray(np.isfinite(_coordinate(phase, name)) & ~np.isfinite(cloud.depth_mm[name]))
+
+
+def lines(calibration: RigCalibration, camera: str) -> EpipolarLines:
+    """Return the epipolar lines of a camera and the projector, or say what isn't calibrated."""
+    projector_from_rig = projector_from_reference(calibration)
+    if calibration.projector is None or projector_from_rig is None:
+        raise StageFailedError(
+            "The projector isn't calibrated: bands follow its epipolar lines; calibrate it or go on without bands."
+        )
+    model = require_camera(calibration, camera)
+    camera_from_rig = from_reference(calibration, calibration.camera_from_world[camera])
+    pose = compose(projector_from_rig, inverse(camera_from_rig))
+    return epipolar_lines(model, pinhole(calibration.projector), pose)
+
+
+@dataclass(frozen=True)
+class _Masks:
+    """What the projector may show of its lines."""
+
+    factor: Float32[np.ndarray, "_h _w"]
+    """The intensity mask, or a single 1."""
+    lines: Mapping[str, EpipolarLines]
+    bands: Mapping[str, Bands]
+
+    def of(self, camera: str, bit: int, *, inverse: bool) -> InMemory:
+        """Return the intensity mask with the other bands dark."""
+        lit = self.bands[camera].lit(self.lines[camera].projector_px, bit, inverse=inverse)
+        return InMemory(lit.astype(np.float32) * self.factor)
+
+
+def capture_plan(
+    patterns: tuple[Pattern, ...],
+    exposures_ms: tuple[float, ...],
+    masks: _Masks,
+    exposure_index: tuple[int, ...],
+    params: BandCaptureParams,
+    doubtful_share: float,
+) -> Plan[BandFrames]:
+    """Take a burst for every camera, bit and half of the bands."""
+    frames: list[Frame] = []
+    sets: list[BandSet] = []
+    for camera, bands in masks.bands.items():
+        for bit in range(bands.bits):
+            for is_inverse in (False, True):
+                pixels = masks.of(camera, bit, inverse=is_inverse)
+                burst = tuple(
+                    Shot(p, t, params.gain_db, (camera,), role="bands", mask=pixels)
+                    for t in exposures_ms
+                    for p in patterns
+                )
+                exposed = yield burst
+                sets.append(BandSet(camera, bit, is_inverse, len(frames), len(burst)))
+                frames += [shot[camera] for shot in exposed]
+    return BandFrames(
+        frames=tuple(frames),
+        sets=tuple(sets),
+        low_px={name: bands.low_px for name, bands in masks.bands.items()},
+        width_px={name: bands.width_px for name, bands in masks.bands.items()},
+        bits=params.bits,
+        exposures_ms=exposures_ms,
+        exposure_index=exposure_index,
+        frame_count=len(frames),
+        exposure_time_s=sum(f.exposure_ms or 0.0 for f in frames) / 1000.0,
+        doubtful_share=doubtful_share,
+    )
+
+
+def _no_bands(bits: int, doubtful_share: float) -> BandFrames:
+    return BandFrames(
+        frames=(),
+        sets=(),
+        low_px={},
+        width_px={},
+        bits=bits,
+        exposure_index=(),
+        exposures_ms=(),
+        frame_count=0,
+        exposure_time_s=0.0,
+        doubtful_share=doubtful_share,
+    )
+
+
+def _number(exposure_ms: float, exposures_ms: tuple[float, ...]) -> int:
+    """Return which exposure of the first fringes this is; 255 for none."""
+    same = [n for n, t in enumerate(exposures_ms) if abs(t - exposure_ms) < 1e-6 * exposure_ms]
+    return same[0] if same else _NO_EXPOSURE
+
+
+def _coordinate(phase: AbsolutePhase, camera: str) -> Float32[np.ndarray, "h w"]:
+    if camera not in phase.projector_px:
+        raise StageFailedError(
+            f"Camera {camera!r} has no columns: bands clear up columns, so code them (directions x or xy)."
+        )
+    return phase.projector_px[camera]
+
+
+def _exposure_ms(
+    phase: AbsolutePhase,
+    exposures: Exposures,
+    doubtful: Bool[np.ndarray, "h w"],
+    facts: RigFacts,
+    params: BandCaptureParams,
+    *,
+    frames: int,
+) -> float:
+    """Return the exposure that serves most of the doubtful pixels, or what the budget leaves for each frame."""
+    used = phase.exposure_index[facts.reference][doubtful]
+    counts = np.bincount(used[used != _NO_EXPOSURE], minlength=len(exposures.exposures_ms))
+    wanted_ms = exposures.exposures_ms[int(np.argmax(counts[: len(exposures.exposures_ms)]))]
+    grid = ExposureGrid.of(facts, snap=params.snap)
+    return grid.ms(grid.index(min(wanted_ms, 1000.0 * params.budget_s / frames)))
+
+
+def _bands(
+    name: str,
+    phase: AbsolutePhase,
+    doubtful: Bool[np.ndarray, "h w"],
+    calibration: RigCalibration,
+    bits: int,
+) -> Bands:
+    """Spread the bands over the lines that the doubtful pixels' light comes from."""
+    reference = calibration.reference
+    own = lines(calibration, reference)
+    if name == reference:
+        return bands_around(own.camera_px[doubtful], bits)
+    # The reference's lines, and the columns measured however wrongly, tell about where on the projector that is.
+    some = np.flatnonzero(doubtful)[:: max(1, np.count_nonzero(doubtful) // _SAMPLE)]
+    numbers_px = own.camera_px.reshape(-1)[some]
+    columns_px = phase.projector_px[reference].reshape(-1)[some]
+    height_px, width_px = own.projector_px.shape
+    columns = np.clip(np.rint(columns_px), 0, width_px - 1).astype(np.int64)
+    rows = np.array(
+        [
+            np.interp(number, own.projector_px[:, column], np.arange(height_px))
+            for number, column in zip(numbers_px, columns, strict=True)
+        ]
+    )
+    other = lines(calibration, name).projector_px
+    return bands_around(other[np.rint(rows).astype(np.int64), columns], bits)
