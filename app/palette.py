@@ -7,12 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from backend.contract.colours import BACKGROUND_RGB, LABEL_COLOURS
+
 Array = NDArray[Any]
 
-LABELS = ("#4f83e0", "#33b08a", "#e0ac3b", "#e0654f", "#a279dc", "#3fb7cf", "#d985b4", "#93a55a")
-"""Of labels 1, 2, 3 ...: apart from each other for colour-blind eyes as well, calm on black."""
 MISSING = "#b3353f"
-BACKGROUND = (22, 25, 30)
 CAMERAS = ("#5b9bf5", "#f0705c", "#55c59a", "#c58bea")
 PROJECTOR = "#d7dde6"
 
@@ -41,7 +40,7 @@ _COLORMAPS = {
 
 def label_colour(label: int) -> str:
     """Return the colour of a label, 1 is the first."""
-    return LABELS[(label - 1) % len(LABELS)]
+    return LABEL_COLOURS[(label - 1) % len(LABEL_COLOURS)]
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
@@ -52,10 +51,10 @@ def rgb(colour: str) -> tuple[int, int, int]:
 @cache
 def colours(colormap: str) -> Array:
     """Return the 256 x 3 colours (RGB, uint8) of a map; an unknown name is gray."""
-    ramp = np.arange(256, dtype=np.uint8)
+    levels = np.arange(256, dtype=np.uint8)
     if colormap not in _COLORMAPS:
-        return np.repeat(ramp[:, None], 3, axis=1)
-    bgr = cv2.applyColorMap(ramp[:, None], _COLORMAPS[colormap])
+        return np.repeat(levels[:, None], 3, axis=1)
+    bgr = cv2.applyColorMap(levels[:, None], _COLORMAPS[colormap])
     return np.ascontiguousarray(bgr[:, 0, ::-1])
 
 
@@ -71,5 +70,5 @@ def paint(values: Array, low: float, high: float, colormap: str) -> Array:
     finite = np.isfinite(values)
     index = np.clip((np.where(finite, values, low) - low) * (255.0 / scale), 0, 255)
     painted: Array = colours(colormap)[index.astype(np.uint8)]
-    painted[~finite] = BACKGROUND
+    painted[~finite] = BACKGROUND_RGB
     return painted

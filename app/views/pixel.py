@@ -12,8 +12,8 @@ from app import markup
 from app.client import ApiClient
 from app.look import Look, fields_of_kind
 from app.numbers import quantity
-from app.palette import BACKGROUND
 from app.views.mask import Labels
+from backend.contract.colours import BACKGROUND_RGB
 from backend.contract.rigs import CameraView, RigView
 
 
@@ -105,7 +105,7 @@ def decoded(body: bytes) -> Any:
         return cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB)
     rgb = cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2RGB)
     if picture.shape[2] == 4:
-        rgb[picture[..., 3] == 0] = BACKGROUND
+        rgb[picture[..., 3] == 0] = BACKGROUND_RGB
     return rgb
 
 

@@ -17,11 +17,8 @@ from backend.cli import (
     serving,
     validating,
 )
+from backend.cli.output import CANCELLED, FAILED
 from backend.domain.errors import CancelledError, UnglareError
-
-FAILED = 1
-CANCELLED = 130
-"""As a shell reports a program that Ctrl+C ended."""
 
 application = typer.Typer(
     name="unglare",

@@ -7,26 +7,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from backend.contract.colours import BACKGROUND_RGB, LABEL_COLOURS
 from backend.domain.errors import InvalidSettingError, NotFoundError
 
 Array = np.ndarray[tuple[int, ...], np.dtype[Any]]
 Kind = Literal["picture", "mask"]
 Format = Literal["png", "jpeg"]
-
-LABEL_COLOURS = (
-    "#4f83e0",
-    "#33b08a",
-    "#e0ac3b",
-    "#e0654f",
-    "#a279dc",
-    "#3fb7cf",
-    "#d985b4",
-    "#93a55a",
-)
-"""Of labels 1, 2, 3 ... (and again from the front), as the station's legend has them; 0 is transparent."""
-
-BACKGROUND_RGB = (22, 25, 30)
-"""What missing pixels look like in a JPEG; a PNG has them transparent."""
 
 _COLORMAPS = {
     "turbo": cv2.COLORMAP_TURBO,

@@ -216,9 +216,10 @@ class Assembly:
             case StageStatus.GIVEN:
                 return _origin(planned)
             case StageStatus.ACCEPTED:
-                return _decided(planned, "Accepted")
+                return f"{_found(planned)} {_decided(planned, 'Accepted')}"
             case StageStatus.REJECTED:
-                return f"{_decided(planned, 'Rejected')} Change a setting or redo it."
+                said = f"{_found(planned)} {_decided(planned, 'Rejected')}"
+                return f"{said} Change a setting or redo it."
             case StageStatus.DONE | StageStatus.AWAITING_REVIEW:
                 return _found(planned)
 

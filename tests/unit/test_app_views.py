@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from app import markup
 from app.client import PointsPreview, ScalarOfPoints
 from app.numbers import duration, heading, named, number, percent, quantity
-from app.palette import LABELS, colours, paint, stops
+from app.palette import colours, paint, stops
 from app.space import LYING, UNIT, Placement
 from app.views.frames import FrameMenu, pattern_text
 from app.views.histogram import Counts, chips_html
@@ -19,7 +19,6 @@ from app.views.points import find_ground, hit, modes, spacing_mm
 from app.views.table import table_html
 from app.views.value import fact_rows
 from backend.contract.scans import ArtifactRef, FieldView, FrameRef
-from backend.services.previews import LABEL_COLOURS
 
 EVIL = '<img src=x onerror="x">'
 
@@ -57,10 +56,6 @@ def test_whatever_is_shown_is_escaped() -> None:
     ]  # fmt: skip
 
     assert [html for html in drawn if "<img" in html] == []
-
-
-def test_the_legend_has_the_colours_of_the_server_s_previews() -> None:
-    assert LABELS == LABEL_COLOURS
 
 
 def test_facts_are_numbers_texts_and_one_per_camera() -> None:

@@ -7,14 +7,9 @@ import numpy as np
 import pytest
 
 from app import palette
+from backend.contract.colours import BACKGROUND_RGB
 from backend.domain.errors import InvalidSettingError, NotFoundError
-from backend.services.previews import (
-    BACKGROUND_RGB,
-    LABEL_COLOURS,
-    draw,
-    live_jpeg,
-    value_at,
-)
+from backend.services.previews import draw, live_jpeg, value_at
 
 
 def seen(picture: bytes) -> np.ndarray[Any, Any]:
@@ -70,7 +65,6 @@ def test_an_unknown_colour_map_is_named() -> None:
 
 
 def test_labels_have_the_colours_of_the_legend() -> None:
-    assert LABEL_COLOURS == palette.LABELS
     labels = np.arange(11, dtype=np.int32)[None, :]
     drawn = seen(draw(labels, kind="mask"))[0]
     assert drawn[0, 3] == 0, "0 is nothing"
@@ -80,7 +74,7 @@ def test_labels_have_the_colours_of_the_legend() -> None:
 
 def test_a_boolean_mask_is_one_label() -> None:
     drawn = seen(draw(np.array([[False, True]]), kind="mask"))[0]
-    assert (drawn[0, 3], tuple(drawn[1, :3])) == (0, palette.rgb(palette.LABELS[0]))
+    assert (drawn[0, 3], tuple(drawn[1, :3])) == (0, palette.rgb(palette.label_colour(1)))
 
 
 def test_large_maps_are_made_smaller_without_mixing_holes_in() -> None:
