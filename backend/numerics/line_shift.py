@@ -156,7 +156,7 @@ def decode_line_shift(
             shifts=stripes.shifts,
             step=float(stripes.step_px),
             first=float(stripes.first_edge_px),
-            reach=float(np.clip(_REACH_PX / stripes.step_px, 1.0, max(stripes.shifts / 5, 1.0))),
+            reach=reach_of(stripes),
             size=float(size_px),
             contrast=float(limits.min_contrast_gray),
             saturation=float(limits.saturation_gray),
@@ -173,6 +173,11 @@ def decode_line_shift(
         out,
     )
     return out
+
+
+def reach_of(stripes: Stripes) -> float:
+    """Return the width of the filter that finds the edge, in shifts of the stripes."""
+    return float(np.clip(_REACH_PX / stripes.step_px, 1.0, max(stripes.shifts / 5, 1.0)))
 
 
 def _checked(

@@ -1,6 +1,7 @@
-"""From projector codes to points: one camera against the calibrated projector."""
+"""From projector codes to points: cameras against the calibrated projector."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt16
@@ -24,12 +25,15 @@ from backend.stages.cloud import (
     enough_points,
     precise_enough,
 )
+from backend.stages.dense_points import dense_cloud
 from backend.stages.edges import Codes
 from backend.stages.rig_geometry import pinhole, projector_from_reference, require_camera
 
 _EXPOSURE_UNKNOWN = 255
 _ROUNDING_PX = float(1 / np.sqrt(12.0))
 """Standard deviation of a position that is known to a whole pixel."""
+_EPIPOLAR_PX = 4.0
+"""Allowed of whole columns, whose rows are whole, too."""
 _FILTER_NAMES = {
     Reason.CLIPPED: "camera pixels nearer or farther than allowed",
     Reason.EPIPOLAR: "camera pixels off their epipolar line",
@@ -39,9 +43,24 @@ _FILTER_NAMES = {
 class CodeCloudParams(Params):
     """Which points are kept."""
 
-    epipolar_px: float = setting(4.0, title="Row against epipolar line", unit="px", gt=0, le=1000)
-    """By how many projector pixels the row code may miss the place where the point projects to:
-    light that came by a second reflection misses it."""
+    cameras: Literal["all", "reference"] = setting("all", title="Cameras used")
+    """all: with sub-pixel columns the second camera averages, contradicts and fills in; reference: one camera."""
+    epipolar_px: float | None = setting(
+        None, title="Row against epipolar line", unit="px", gt=0, le=1000, auto="consistency_px"
+    )
+    """By how many projector pixels the row code may miss the place where the point projects to: light that
+    came by a second reflection misses it. Automatic: 4 for whole columns; as fine as the rows are read for
+    sub-pixel columns."""
+    agreement_px: float = setting(
+        0.3, title="Contradiction of two cameras", unit="px", ge=0, le=100, advanced=True
+    )
+    """In projector pixels beside 5 sigma of noise: beyond it neither is believed."""
+    outlier_sigmas: float = setting(6.0, title="Outliers beyond", unit="sigma", ge=0, le=100)
+    """Sub-pixel columns only: points so far from the median of their 5x5 neighbourhood, and alone there, are
+    removed; 0 = off."""
+    speck_px: int | None = setting(None, title="Smallest patch", unit="px", ge=0, le=100_000)
+    """Sub-pixel columns only: connected patches of fewer pixels are removed; 0 = off. Automatic: one in 20 000 of
+    the picture's pixels."""
     spread_px: float = setting(
         3.0, title="Spread of one code", unit="px", gt=0, le=1000, advanced=True
     )
@@ -52,16 +71,19 @@ class CodeCloudParams(Params):
     """Distance from the camera along its axis; none: no limit."""
 
 
-@stage(title="Cloud", version=1, review=Review.ON_WARNING, checks=(enough_points, precise_enough))
+@stage(title="Cloud", version=2, review=Review.ON_WARNING, checks=(enough_points, precise_enough))
 def code_cloud(
     codes: Codes, calibration: RigCalibration, params: CodeCloudParams, progress: Progress
 ) -> Cloud:
-    """Intersect each camera ray with its projector column, checked by the row: one point per projector pixel."""
+    """Intersect each camera ray with its projector column, checked by the row and by a second camera."""
     rig = _Pair.of(calibration)
     if rig.name not in codes.projector_px:
         raise StageFailedError(
             f"Camera {rig.name!r} has no column code: points need the columns of the reference camera."
         )
+    if rig.name in codes.sigma_px:
+        progress(0.0, "every pixel against the projector")
+        return dense_cloud(codes, calibration, _cameras(codes, calibration, params), params)
     progress(0.0, "every pixel against its epipolar line")
     pixels = _pixel_points(codes, rig, params)
     progress(0.5, "projector pixels")
@@ -69,7 +91,20 @@ def code_cloud(
         points = _points_of_projector(codes, rig, params, pixels)
     else:
         points = _points_of_pixels(rig, pixels)
-    return _cloud(codes, rig, pixels, points)
+    return _cloud(codes, rig, pixels, points, _epipolar_px(params))
+
+
+def _cameras(codes: Codes, calibration: RigCalibration, params: CodeCloudParams) -> tuple[str, ...]:
+    """Name the cameras that take part, the reference first."""
+    first = calibration.reference
+    if params.cameras == "reference":
+        return (first,)
+    others = [n for n in codes.sigma_px if n != first and n in calibration.camera_from_world]
+    return (first, *others)
+
+
+def _epipolar_px(params: CodeCloudParams) -> float:
+    return params.epipolar_px or _EPIPOLAR_PX
 
 
 @dataclass(frozen=True)
@@ -124,7 +159,7 @@ def _pixel_points(codes: Codes, rig: _Pair, params: CodeCloudParams) -> _PixelPo
     residual_px = projector_consistency(
         points_mm, rows, rig.projector, rig.projector_from_camera, rows=True
     )
-    off = _reject(reasons, ~(np.abs(residual_px) <= params.epipolar_px), Reason.EPIPOLAR)
+    off = _reject(reasons, ~(np.abs(residual_px) <= _epipolar_px(params)), Reason.EPIPOLAR)
     sigma_px = max(_ROUNDING_PX, _robust_sigma(residual_px[reasons == 0]))
     return _PixelPoints(points_mm, reasons, sigma_px, (clipped, off))
 
@@ -190,7 +225,7 @@ def _points_of_projector(
         rig.projector,
         rig.projector_from_camera,
     )
-    on_line = np.abs(result.row_residual_px) <= params.epipolar_px
+    on_line = np.abs(result.row_residual_px) <= _epipolar_px(params)
     together = seen.spread_px <= params.spread_px
     keep = on_line & together
     at = seen.projector_px[keep]
@@ -227,7 +262,9 @@ def _projector_normals(
     return found
 
 
-def _cloud(codes: Codes, rig: _Pair, pixels: _PixelPoints, points: _Points) -> Cloud:
+def _cloud(
+    codes: Codes, rig: _Pair, pixels: _PixelPoints, points: _Points, epipolar_px: float
+) -> Cloud:
     """Bring the points into the order of the camera's pixels and describe them."""
     pixel_px = np.round(points.camera_px).astype(np.int64)
     order = np.asarray(np.lexsort((pixel_px[:, 0], pixel_px[:, 1])), np.int64)
@@ -251,4 +288,5 @@ def _cloud(codes: Codes, rig: _Pair, pixels: _PixelPoints, points: _Points) -> C
         median_sigma_mm=float(np.median(sigma_mm)) if order.size else float("nan"),
         kept_share=int(np.count_nonzero(pixels.valid)) / max(decoded, 1),
         cameras=(rig.name,),
+        consistency_px=epipolar_px if rig.name in codes.projector_row_px else float("nan"),
     )

@@ -61,6 +61,9 @@ class EdgesParams(Params):
     own_light: float = setting(0.5, title="Light of the own edge", ge=0, le=1, advanced=True)
     """Share of a pixel's light that has to come from within 3 px of the edge found, not from a second reflection
     or another surface. Only with shifted stripes."""
+    separate: bool = setting(True, title="Separate second reflections", advanced=True)
+    """Where a pixel sees two places of the stripes at once, as in the corners of shiny parts, keep the brighter
+    one. Only with shifted stripes."""
 
 
 @dataclass(frozen=True)
@@ -289,6 +292,7 @@ def _shift(
         ),
         mask=mask,
         across_px=None if across is None else across.gray.projector_px,
+        separate=params.separate and params.decoding == "delta",
     )
 
 

@@ -9,6 +9,7 @@ from backend.domain.errors import StageFailedError
 from backend.domain.rig import CameraFacts, ProjectorFacts
 from backend.numerics.edge_positions import EdgePositions, edge_positions
 from backend.numerics.line_shift import LineShift, LineShiftLimits, Stripes, decode_line_shift
+from backend.numerics.mixed_light import separate_lights
 from backend.numerics.reasons import Reason
 from backend.numerics.uncertainty import NoiseModel
 from backend.stages.code_frames import CodeSet, StripeSet
@@ -36,6 +37,7 @@ def shifted_edges(
     limits: LineShiftLimits,
     mask: IntensityMask | None,
     across_px: Float32[np.ndarray, "h w"] | None,
+    separate: bool,
 ) -> ShiftedEdges:
     """Locate the stripes of a set, whose Gray code names each pixel's stripe.
 
@@ -48,17 +50,24 @@ def shifted_edges(
     limits = limits._replace(coarse_error_px=_coarse_error_px(coarse_width_px, stripes))
     patterns = [f.gray for f in code.stripes.patterns]
     inverses = [f.gray for f in code.stripes.inverses]
+    factor = None if mask is None else _factor(mask, code.axis, projector)
+    noise = _noise(camera, code.stripes)
     located = decode_line_shift(
         patterns,
         inverses,
         stripes,
         coarse_px,
         size_px=size_px,
-        noise=_noise(camera, code.stripes),
+        noise=noise,
         limits=limits,
-        mask=None if mask is None else _factor(mask, code.axis, projector),
+        mask=factor,
         across_px=across_px,
     )
+    if separate:
+        found = separate_lights(
+            patterns, inverses, stripes, located, noise=noise, mask=factor, across_px=across_px
+        )
+        located = located._replace(projector_px=found.projector_px, sigma_px=found.sigma_px)
     return ShiftedEdges(located, _edges(code, located, stripes, size_px))
 
 

@@ -199,6 +199,6 @@ def test_other_patterns_are_passed_over():
     assert import_code_frames(frames) == CodeFrames(frames, len(frames))
 
 
-def test_the_method_starts_from_imported_frames():
-    assert [s.name for s in METHOD.stages] == ["edges", "code_cloud"]
-    assert METHOD.importers[CodeFrames.__name__] is import_code_frames
+def test_the_method_ends_with_the_code_and_starts_from_imported_frames():
+    assert [s.name for s in METHOD.stages][-3:] == ["code_capture", "edges", "code_cloud"]
+    assert METHOD.importers["code_capture"] is import_code_frames
