@@ -87,7 +87,7 @@ def _doubtful(depth: Any, coordinate: Any) -> Any:
     count = 0
     for i in range(depth.size):
         # NaN is the only value that doesn't equal itself
-        count += np.int64(1 if depth[i] != depth[i] and coordinate[i] == coordinate[i] else 0)
+        count += 1 if depth[i] != depth[i] and coordinate[i] == coordinate[i] else 0
     return count
 
 

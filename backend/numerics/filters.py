@@ -221,7 +221,7 @@ def _limit_row(depth: Any, values: Any, sigma: Any, limits: Any, keep: Any) -> A
         outside = (values[i] < low - slack) | (values[i] > high + slack)  # False with NaN
         valid = depth[i] == depth[i]
         keep[i] = valid & ~outside
-        removed += np.int64(1 if valid & outside else 0)
+        removed += 1 if valid & outside else 0
     return removed
 
 

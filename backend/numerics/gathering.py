@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from backend.numerics.kernels import kernel, kernel_input, row_loop
-from backend.numerics.lattice import Lattice, lattice_row
+from backend.numerics.lattice import Lattice
 from backend.numerics.normals import new_normal_work, normal_nodes, normal_row
 from backend.numerics.triangulation import Cloud
 

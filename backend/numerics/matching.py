@@ -8,7 +8,7 @@ from jaxtyping import Float32, UInt16
 
 from backend.numerics.errors import MatchingError
 from backend.numerics.kernels import kernel, kernel_input, row_loop
-from backend.numerics.lattice import lattice_row
+from backend.numerics.lattice import Lattice, lattice_row
 from backend.numerics.reasons import Reason
 from backend.numerics.rectification import Canvas, Rectification
 
@@ -29,8 +29,6 @@ class Matches(NamedTuple):
     """Rectified x of the partner."""
     sigma_disparity_px: Float32[np.ndarray, "h w"]
     """Standard deviation of the difference of both rectified x, from the noise of both coordinates."""
-    slope: Float32[np.ndarray, "h w"]
-    """Change of the projector coordinate per rectified px at the partner; its sign says how the code runs."""
     reasons: UInt16[np.ndarray, "h w"]
     """Why a pixel with a coordinate has no partner: `Reason` bits; 0 where the coordinate itself is missing."""
 
@@ -38,17 +36,24 @@ class Matches(NamedTuple):
 _DEFAULTS = MatchSettings()
 _EMPTY = np.float32(np.nan)
 _ONE = np.uint64(1)
+# Numbers in a kernel have to be float32 one by one: a Python float makes the whole loop float64.
+_ZERO, _HALF, _ONE_PX, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 _MANY = np.float32(np.inf)
 _NO_MATCH = np.uint16(Reason.NO_MATCH)
 _AMBIGUOUS = np.uint16(Reason.AMBIGUOUS_MATCH)
 _ONE_WAY = np.uint16(Reason.LEFT_RIGHT_CHECK)
 _SAME_PLACE_PX = 3.0
+_NEAR = np.float32(_SAME_PLACE_PX)
 """Crossings of one coordinate this near to each other are noise on one surface, not two surfaces."""
 _JUMP_STEPS = 5.0
+_CHECKED_ROWS = 2
+"""The check both ways looks at every n-th row of the reference: it asks for a place within pixels."""
+_TILE = 512
+"""Pixels whose intermediate rows stay in the first-level cache."""
 _CELLS_MAX = 4
-_FLATTEST = 50.0
+_FLATTEST = np.float32(50.0)
 """Spread of four pixels over the change along the epipolar line above which the line can't be followed."""
-_HAIR = 1e-3
+_HAIR = np.float32(1e-3)
 """Overshoot in [px] that isn't worth another step to the neighbouring four pixels."""
 
 
@@ -77,7 +82,7 @@ def match(
 
     Returns
     -------
-    Rectified x of the partner, its uncertainty, slope and reasons, float32 and uint16.
+    Rectified x of the partner, its uncertainty and reasons, float32 and uint16.
 
     Raises
     ------
@@ -88,12 +93,17 @@ def match(
     Notes
     -----
     An index per row of the rectified plane says at which x the other camera's coordinate crosses each of a series
-    of values; it is filled from the nearest pixels and serves as a start only. From there Newton's
+    of values; it is filled from the nearest pixels, each at its true place, and serves as a start only: 97 of 100
+    starts lie among the four pixels of their solution. From there Newton's
     method runs along the exact epipolar line on the *original* map of the other camera, bilinear inside
     one valid 2x2 neighbourhood without a jump. So the reference isn't resampled, the other is interpolated
-    once, and neither rectified size nor rotation touches the accuracy. With the weights w of the four pixels
+    once, and neither rectified size nor rotation touches the accuracy. With the weights w of the four pixels, and
+    the nearest one's noise standing for all four,
 
-    .. math:: \sigma_d^2 = \frac{\sigma_{ref}^2 + \sum_i w_i^2 \sigma_i^2}{(\partial u / \partial x)^2}
+    .. math:: \sigma_d^2 = \frac{\sigma_{ref}^2 + \sigma_{other}^2 \sum_i w_i^2}{(\partial u / \partial x)^2}
+
+    The first step is taken for a tile of pixels at a time, in plain loops; what then lies among other four pixels
+    goes on one by one.
 
     A coordinate that crosses at two places of the row is ambiguous; a partner whose own index entry leads
     to another pixel of the reference fails the left-right check. No disparity range is needed.
@@ -105,10 +115,18 @@ def match(
     jump = settings.jump_px if settings.jump_px is not None else _JUMP_STEPS * step
     grid = _grid(other_px, step, rectification.other.width_px)
     pixel_of_other = rectification.pixel_of_other.map()
-    index_other = _index(other_px, pixel_of_other, rectification.other, grid, jump)
-    index_reference = _reference_index(reference_px, rectification, grid, jump)
+    index = Index(
+        _index(
+            reference_px,
+            rectification.pixel_of_reference,
+            rectification.reference,
+            grid,
+            jump,
+            _CHECKED_ROWS,
+        ),
+        _index(other_px, rectification.pixel_of_other, rectification.other, grid, jump, 1),
+    )
     out = Matches(
-        np.empty(reference_px.shape, np.float32),
         np.empty(reference_px.shape, np.float32),
         np.empty(reference_px.shape, np.float32),
         np.empty(reference_px.shape, np.uint16),
@@ -121,10 +139,15 @@ def match(
         unknown if sigma_other_px is None else kernel_input(sigma_other_px),
         rectification.rectified_of_reference.nodes,
         pixel_of_other,
-        np.array(rectification.other[:2], np.float64),
-        index_reference,
-        index_other,
-        np.array([grid.low, grid.step, jump, settings.agreement_px], np.float64),
+        index,
+        Limits(
+            np.float32(rectification.other.x0_px),
+            np.float32(rectification.other.y0_px),
+            np.float32(grid.low),
+            np.float32(1.0 / grid.step),
+            np.float32(jump),
+            np.float32(settings.agreement_px),
+        ),
         *out,
     )
     return out
@@ -227,32 +250,20 @@ def _grid(other_px: Float32[np.ndarray, "h2 w2"], step: float, width_px: int) ->
 
 def _index(
     values: Float32[np.ndarray, "h w"],
-    pixel_of_canvas: Float32[np.ndarray, "2 rows columns"],
+    pixel_of_canvas: Lattice,
     canvas: Canvas,
     grid: _Grid,
     jump: float,
-) -> Float32[np.ndarray, "rows cells"]:
-    index = np.empty((canvas.height_px, grid.cells), np.float32)
-    _index_rows(values, pixel_of_canvas, float(canvas.x0_px), grid.low, grid.step, jump, index)
-    return index
-
-
-def _reference_index(
-    reference_px: Float32[np.ndarray, "h w"],
-    rectification: Rectification,
-    grid: _Grid,
-    jump: float,
-) -> Float32[np.ndarray, "rows cells"]:
-    canvas = rectification.reference
-    index = np.empty((canvas.height_px, grid.cells), np.float32)
-    _index_lattice_rows(
-        reference_px,
-        rectification.pixel_of_reference.nodes,
+    every: int,
+) -> Float32[np.ndarray, "rows cells_1"]:
+    """Note where every n-th row of a canvas crosses the grid's values; the last cell takes what isn't wanted."""
+    index = np.empty((-(-canvas.height_px // every), grid.cells + 1), np.float32)
+    _index_rows(
+        values,
+        pixel_of_canvas.nodes,
         canvas.width_px,
-        float(canvas.x0_px),
-        grid.low,
-        grid.step,
-        jump,
+        every,
+        np.array([canvas.x0_px, grid.low, 1.0 / grid.step, jump / grid.step], np.float32),
         index,
     )
     return index
@@ -261,87 +272,127 @@ def _reference_index(
 # ---------------------------------------------------------------- kernels
 
 
+class Index(NamedTuple):
+    """At which x the rows of both canvases cross each value low + k step; inf where at two places."""
+
+    reference: Any  # float32[rows / _CHECKED_ROWS, cells + 1]
+    other: Any  # float32[rows, cells + 1]
+
+
+class Limits(NamedTuple):
+    """Numbers of a whole match."""
+
+    x0: Any  # float32: first column of the other canvas
+    y0: Any
+    low: Any  # float32: the grid's first value
+    per_step: Any  # float32: one over the grid's step
+    jump: Any
+    agreement: Any
+
+
 @row_loop
 def _nearest(values: Any, px: Any, py: Any, out: Any) -> Any:
     """Pick the pixel nearest to each position; NaN outside."""
     height, width = values.shape
+    right, bottom = np.float32(width), np.float32(height)
     for i in range(out.size):
-        x = np.int32(np.floor(px[i] + np.float32(0.5)))
-        y = np.int32(np.floor(py[i] + np.float32(0.5)))
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        out[i] = values[y, x] if inside else _EMPTY
+        x, y = np.floor(px[i] + _HALF), np.floor(py[i] + _HALF)
+        inside = (x >= _ZERO) & (x < right) & (y >= _ZERO) & (y < bottom)
+        # unsigned, or each access would test for an index that counts from the end
+        column = np.uint64(np.int32(x)) if inside else np.uint64(0)
+        row = np.uint64(np.int32(y)) if inside else np.uint64(0)
+        value = values[row, column]
+        out[i] = value if inside else _EMPTY
 
 
 @row_loop
-def _crossings(row: Any, x0: Any, low: Any, step: Any, jump: Any, out: Any) -> Any:
+def _true_places(px: Any, py: Any, x0: Any, across: Any, down: Any, place: Any) -> Any:
+    """Say where on the canvas the pixels lie that `_nearest` picks."""
+    for i in range(place.size):
+        off_x = np.floor(px[i] + _HALF) - px[i]
+        off_y = np.floor(py[i] + _HALF) - py[i]
+        place[i] = x0 + np.float32(i) + across * off_x + down * off_y
+
+
+@row_loop
+def _note(k: Any, place: Any, out: Any) -> Any:
+    """Write one crossing into its cell; two far apart make it infinite."""
+    old = out[k]
+    same = old if abs(old - place) <= _NEAR else _MANY
+    out[k] = place if np.isnan(old) else same
+
+
+@row_loop
+def _crossings(row: Any, place: Any, low: Any, per_step: Any, jump_cells: Any, out: Any) -> Any:
     """Write where the row crosses each value low + k step; inf where it does so at two places."""
-    for k in range(out.size):
-        out[k] = _EMPTY
-    before = (row[0] - low) / step
-    jump_cells = jump / step
+    size = out.size - 1
+    end, spare = np.float32(size), np.uint64(size)
+    for cell in range(out.size):
+        out[cell] = _EMPTY
+    before = (row[0] - low) * per_step
     for i in range(1, row.size):
-        now = (row[i] - low) / step
+        now = (row[i] - low) * per_step
         difference = now - before
-        if abs(difference) <= jump_cells and difference != 0.0:  # False with NaN
-            first = np.int64(np.ceil(min(before, now)))
-            last = np.int64(np.floor(max(before, now)))
-            begin, end = max(first, np.int64(0)), min(last, np.int64(out.size - 1))
-            for k in range(begin, end + 1):
-                place = np.float32(x0 + i - 1 + (k - before) / difference)
-                if np.isnan(out[k]):
-                    out[k] = place
-                elif not abs(out[k] - place) <= _SAME_PLACE_PX:
-                    out[k] = _MANY
+        if abs(difference) <= jump_cells:  # False with NaN
+            highest, lowest = max(before, now), min(before, now)
+            top = np.floor(highest)
+            per_cell = (place[i] - place[i - 1]) / difference
+            # Mostly none, one or two: written without asking, what isn't crossed into the spare cell. Whether
+            # a value is crossed can't be foreseen, so each question would cost more than the answer.
+            for step in range(2):
+                level = top - np.float32(step)
+                crossed = (level >= lowest) & (level >= _ZERO) & (level < end) & (highest > lowest)
+                k = np.uint64(np.int32(level)) if crossed else spare
+                _note(k, place[i - 1] + (level - before) * per_cell, out)
+            if difference > _TWO or difference < -_TWO:
+                level = top - _TWO
+                while level >= lowest:
+                    if _ZERO <= level < end:
+                        _note(
+                            np.uint64(np.int32(level)),
+                            place[i - 1] + (level - before) * per_cell,
+                            out,
+                        )
+                    level -= _ONE_PX
         before = now
 
 
 @kernel
-def _index_rows(
-    values: Any, pixel_of_canvas: Any, x0: Any, low: Any, step: Any, jump: Any, index: Any
-) -> None:
-    for y in numba.prange(index.shape[0]):
-        row = np.empty(pixel_of_canvas.shape[2], np.float32)
-        _nearest(values, pixel_of_canvas[0, y], pixel_of_canvas[1, y], row)
-        _crossings(row, x0, low, step, jump, index[y])
-
-
-@kernel
-def _index_lattice_rows(
-    values: Any, nodes: Any, width: Any, x0: Any, low: Any, step: Any, jump: Any, index: Any
-) -> None:
-    for y in numba.prange(index.shape[0]):
-        row = np.empty(width, np.float32)
-        px = np.empty(width, np.float32)
-        py = np.empty(width, np.float32)
+def _index_rows(values: Any, nodes: Any, width: Any, every: Any, numbers: Any, index: Any) -> None:
+    for number in numba.prange(index.shape[0]):
+        y = np.int64(number) * every
+        rows = np.empty((4, width), np.float32)
+        px, py, row, place = rows[0], rows[1], rows[2], rows[3]
         work = np.empty(nodes.shape[2], np.float64)
         lattice_row(nodes[0], y, work, px)
         lattice_row(nodes[1], y, work, py)
         _nearest(values, px, py, row)
-        _crossings(row, x0, low, step, jump, index[y])
+        # the canvas' direction in the picture, hardly changing along a row
+        across = (px[width - 1] - px[0]) / np.float32(width - 1)
+        down = (py[width - 1] - py[0]) / np.float32(width - 1)
+        square = across * across + down * down
+        _true_places(px, py, numbers[0], across / square, down / square, place)
+        _crossings(row, place, numbers[1], numbers[2], numbers[3], index[number])
 
 
 @row_loop
-def _look_up(index_row: Any, cell: Any) -> Any:
-    """Return the place of a coordinate between two index entries, and a second one if they are far apart."""
-    below = np.floor(cell)
-    if not (below >= 0.0 and below < index_row.size - 1):
-        return _EMPTY, _EMPTY
-    k = np.uint64(np.int64(below))
-    a, b = index_row[k], index_row[k + _ONE]
+def _two_entries(a: Any, b: Any, part: Any) -> Any:
+    """Return the place between two index entries, and a second one if they are far apart."""
     if np.isnan(a):
         return b, _EMPTY
     if np.isnan(b):
         return a, _EMPTY
-    if abs(a - b) <= 2.0 * _SAME_PLACE_PX:  # False if one is inf
-        return np.float32(a + (cell - below) * (b - a)), _EMPTY
-    if cell - below < 0.5:
+    if abs(a - b) <= _TWO * _NEAR:  # False if one is inf
+        return a + part * (b - a), _EMPTY
+    if part < _HALF:
         return a, b
     return b, a
 
 
 @row_loop
-def _mutual(first: Any, second: Any, x: Any, agreement: Any) -> Any:
+def _mutual(a: Any, b: Any, part: Any, x: Any, agreement: Any) -> Any:
     """Tell whether the reference's own index leads from the coordinate back to x."""
+    first, second = _two_entries(a, b, part)
     if np.isnan(first):
         return True  # a sliver narrower than the index: nothing speaks against it
     # inf, two places in the reference, is never near
@@ -350,42 +401,189 @@ def _mutual(first: Any, second: Any, x: Any, agreement: Any) -> Any:
 
 @row_loop
 def _start_row(
-    targets: Any,
-    x: Any,
-    line: Any,
-    index_reference: Any,
-    index_other: Any,
-    limits: Any,
-    start: Any,
-    second: Any,
-    reasons: Any,
+    targets: Any, x: Any, line: Any, index: Any, limits: Any, start: Any, second: Any, reasons: Any
 ) -> Any:
     """Look up where to start on each pixel's epipolar line; say whether a pixel has two places."""
-    low, scale, agreement = limits[0], 1.0 / limits[1], limits[3]
+    rows, cells = np.float32(index.other.shape[0]), np.float32(index.other.shape[1] - 2)
     two_places = False
     for i in range(targets.size):
-        start[i] = second[i] = np.nan
+        start[i] = second[i] = _EMPTY
         reasons[i] = 0
         if np.isnan(targets[i]):
             continue
-        nearest = np.floor(line[i] + 0.5)
-        if nearest < 0 or nearest >= index_other.shape[0]:
+        nearest = line[i] + _HALF
+        cell = (targets[i] - limits.low) * limits.per_step
+        if not ((nearest >= _ZERO) & (nearest < rows) & (cell >= _ZERO) & (cell < cells)):
             reasons[i] = _NO_MATCH
             continue
-        row = np.uint64(np.int64(nearest))
-        cell = (targets[i] - low) * scale
-        first, other = _look_up(index_other[row], cell)
-        back, back_too = _look_up(index_reference[row], cell)
+        row, k = np.uint64(np.int32(nearest)), np.uint64(np.int32(cell))
+        part = cell - np.float32(np.int32(cell))
+        a, b = index.other[row, k], index.other[row, k + _ONE]
+        row //= np.uint64(_CHECKED_ROWS)
+        c, d = index.reference[row, k], index.reference[row, k + _ONE]
+        back = c + part * (d - c)
+        if (
+            (abs(a - b) <= _TWO * _NEAR)
+            & (abs(c - d) <= _TWO * _NEAR)
+            & (abs(back - x[i]) <= limits.agreement)
+        ):  # nearly always; False with NaN and inf
+            start[i] = a + part * (b - a) - limits.x0
+            continue
+        first, other = _two_entries(a, b, part)
         if np.isnan(first):
             reasons[i] = _NO_MATCH
         elif np.isinf(first) or np.isinf(other):
             reasons[i] = _AMBIGUOUS
-        elif not _mutual(back, back_too, x[i], agreement):
+        elif not _mutual(c, d, part, x[i], limits.agreement):
             reasons[i] = _ONE_WAY
         else:
-            start[i], second[i] = first, other
+            start[i], second[i] = first - limits.x0, other - limits.x0
             two_places |= not np.isnan(other)
     return two_places
+
+
+# The first step, a tile of pixels at a time: plain loops over few rows, and what is looked up apart from what is
+# calculated, so that the latter become vector instructions.
+
+
+@row_loop
+def _corner_of(x: Any, y: Any, width: Any, height: Any, corner: Any, right: Any, below: Any) -> Any:
+    """Return the number of the upper left of the four pixels around a position, and the position among them."""
+    last_x, last_y = np.float32(width - 2), np.float32(height - 2)
+    stride = np.int32(width)
+    for n in range(corner.size):
+        # Written so that NaN ends at 0: a wild index would read foreign memory.
+        at_x = x[n] if x[n] > _ZERO else _ZERO
+        at_y = y[n] if y[n] > _ZERO else _ZERO
+        at_x = at_x if at_x < last_x else last_x
+        at_y = at_y if at_y < last_y else last_y
+        column, row = np.int32(at_x), np.int32(at_y)
+        right[n] = x[n] - np.float32(column)
+        below[n] = y[n] - np.float32(row)
+        corner[n] = row * stride + column
+
+
+@row_loop
+def _follow(
+    plane: Any, next_row: Any, corner: Any, right: Any, below: Any, out: Any, change: Any
+) -> Any:
+    """Interpolate a smooth plane, and give its change along the row."""
+    for n in range(corner.size):
+        k = np.uint64(corner[n])
+        value = plane[k]
+        change[n] = plane[k + _ONE] - value
+        out[n] = value + right[n] * change[n] + below[n] * (next_row[k] - value)
+
+
+@row_loop
+def _evaluate(
+    values: Any,
+    next_row: Any,
+    corner: Any,
+    a: Any,
+    b: Any,
+    dx: Any,
+    dy: Any,
+    value: Any,
+    slope: Any,
+    spread: Any,
+) -> Any:
+    """Interpolate between four pixels: value, slope along the epipolar line, range of the four."""
+    for n in range(corner.size):
+        k = np.uint64(corner[n])
+        u00, u01, u10, u11 = values[k], values[k + _ONE], next_row[k], next_row[k + _ONE]
+        top, bottom, left = u01 - u00, u11 - u10, u10 - u00
+        twist = bottom - top
+        slope[n] = (top + b[n] * twist) * dx[n] + (left + a[n] * twist) * dy[n]
+        value[n] = u00 + a[n] * top + b[n] * (left + a[n] * twist)
+        spread[n] = max(max(u00, u01), max(u10, u11)) - min(min(u00, u01), min(u10, u11))
+
+
+@row_loop
+def _step(
+    targets: Any, value: Any, slope: Any, spread: Any, jump: Any, a: Any, b: Any, move: Any
+) -> Any:
+    """Take one Newton step; NaN where the four pixels are no surface that can be followed."""
+    for n in range(move.size):
+        good = (spread[n] <= jump) & (abs(slope[n]) * _FLATTEST >= spread[n])
+        good &= (abs(a[n] - _HALF) <= _HALF) & (abs(b[n] - _HALF) <= _HALF)  # within the picture
+        step = (targets[n] - value[n]) / slope[n]
+        move[n] = step if good & (abs(step) <= _NEAR) else _EMPTY
+
+
+@row_loop
+def _land(
+    start: Any, move: Any, a: Any, b: Any, dx: Any, dy: Any, x: Any, again: Any, weight: Any
+) -> Any:
+    """Accept what stays among its four pixels, and say from where the others have to go on."""
+    middle = _HALF + _HAIR
+    for n in range(move.size):
+        right, below = a[n] + move[n] * dx[n], b[n] + move[n] * dy[n]
+        # Inside the cell whose four pixels gave the slope there is nothing left to correct.
+        inside = (abs(right - _HALF) <= middle) & (abs(below - _HALF) <= middle)  # False with NaN
+        place = start[n] + move[n]
+        x[n] = place if inside else _EMPTY
+        again[n] = _EMPTY if inside else place
+        left, above = _ONE_PX - right, _ONE_PX - below
+        weight[n] = (left * left + right * right) * (above * above + below * below)
+
+
+@row_loop
+def _weigh(sigma: Any, corner: Any, a: Any, b: Any, stride: Any, weight: Any, variance: Any) -> Any:
+    """Variance of an interpolated value whose four pixels are as noisy as the nearest one."""
+    for n in range(corner.size):
+        column = np.int32(1 if a[n] > _HALF else 0)
+        row = np.int32(stride if b[n] > _HALF else 0)
+        noise = sigma[np.uint64(corner[n] + column + row)]
+        variance[n] = weight[n] * noise * noise
+
+
+@row_loop
+def _first_step(
+    values: Any,
+    sigma: Any,
+    pixel_of_canvas: Any,
+    targets: Any,
+    start: Any,
+    line: Any,
+    jump: Any,
+    rows: Any,
+    x: Any,
+    slope: Any,
+    variance: Any,
+    again: Any,
+) -> Any:
+    """Refine the starts of one tile; `again` holds those that left their four pixels, else NaN."""
+    size = targets.size
+    rows_px, columns = pixel_of_canvas.shape[1], pixel_of_canvas.shape[2]
+    height, width = values.shape
+    corner, flat = rows.corner[:size], values.reshape(-1)
+    right, below, dx, dy = (
+        rows.single[0, :size],
+        rows.single[1, :size],
+        rows.single[2, :size],
+        rows.single[3, :size],
+    )
+    px, py, move, weight = (
+        rows.single[4, :size],
+        rows.single[5, :size],
+        rows.single[6, :size],
+        rows.single[7, :size],
+    )
+    _corner_of(start, line, columns, rows_px, corner, right, below)
+    plane = pixel_of_canvas[0].reshape(-1)
+    _follow(plane, plane[columns:], corner, right, below, px, dx)
+    plane = pixel_of_canvas[1].reshape(-1)
+    _follow(plane, plane[columns:], corner, right, below, py, dy)
+    _corner_of(px, py, width, height, corner, right, below)
+    # value and spread take the places that aren't used any more
+    _evaluate(flat, flat[width:], corner, right, below, dx, dy, px, slope, py)
+    _step(targets, px, slope, py, jump, right, below, move)
+    _land(start, move, right, below, dx, dy, x, again, weight)
+    if sigma.shape[0] == height:
+        _weigh(sigma.reshape(-1), corner, right, below, width, weight, variance)
+    else:
+        variance[:] = _ZERO
 
 
 @row_loop
@@ -396,22 +594,20 @@ def _refine_row(  # noqa: C901  # one loop: splitting it costs a call with 40 ar
     targets: Any,
     start: Any,
     line: Any,
-    x0: Any,
     jump: Any,
     out_x: Any,
     out_slope: Any,
     out_variance: Any,
 ) -> Any:
-    """Follow each epipolar line from its start to where the coordinate is the target.
+    """Follow each epipolar line that has a start to where the coordinate is the target.
 
-    Writes x, the slope du/dx and the variance of u there; NaN if there is no such place nearby.
+    Writes x, the slope du/dx and the variance of u there; nothing if there is no such place nearby.
     """
     height, width = values.shape
     rows, columns = pixel_of_canvas.shape[1], pixel_of_canvas.shape[2]
     noisy = sigma.shape[0] == height
     for n in range(targets.size):
-        out_x[n] = out_slope[n] = out_variance[n] = np.nan
-        x = start[n] - x0
+        x = np.float64(start[n])
         if np.isnan(x):
             continue
         last = x
@@ -455,7 +651,7 @@ def _refine_row(  # noqa: C901  # one loop: splitting it costs a call with 40 ar
             a, b = a + move * dpx, b + move * dpy
             # Inside the cell whose four pixels gave the slope there is nothing left to correct.
             if min(a, b) >= -_HAIR and max(a, b) <= 1.0 + _HAIR:
-                out_x[n], out_slope[n], out_variance[n] = x + x0, slope, 0.0
+                out_x[n], out_slope[n], out_variance[n] = x, slope, 0.0
                 if noisy:
                     out_variance[n] = (
                         ((1.0 - a) * (1.0 - b) * sigma[j, i]) ** 2
@@ -490,21 +686,92 @@ def _choose_row(
 
 @row_loop
 def _finish_row(
-    targets: Any,
-    sigma_row: Any,
-    x: Any,
-    slope: Any,
-    variance: Any,
-    out_x: Any,
-    out_sigma: Any,
-    out_slope: Any,
-    out_reasons: Any,
+    x: Any, slope: Any, sigma: Any, variance: Any, x0: Any, out: Any, out_sigma: Any
 ) -> Any:
     for i in range(x.size):
-        out_x[i], out_slope[i] = x[i], slope[i]
-        out_sigma[i] = np.sqrt(sigma_row[i] * sigma_row[i] + variance[i]) / abs(slope[i])
-        if np.isnan(x[i]) and not np.isnan(targets[i]) and out_reasons[i] == 0:
-            out_reasons[i] = _NO_MATCH
+        out[i] = x[i] + x0
+        noise = np.sqrt(sigma[i] * sigma[i] + variance[i]) / abs(slope[i])
+        out_sigma[i] = noise if x[i] == x[i] else _EMPTY
+
+
+@row_loop
+def _explain_row(targets: Any, x: Any, reasons: Any) -> Any:
+    for i in range(x.size):
+        lost = (x[i] != x[i]) & (targets[i] == targets[i]) & (reasons[i] == 0)
+        reasons[i] = _NO_MATCH if lost else reasons[i]
+
+
+class _Rows(NamedTuple):
+    """Intermediate values of one tile."""
+
+    single: Any  # float32[8, tile]
+    corner: Any  # int32[tile]
+
+
+@row_loop
+def _match_row(
+    reference_row: Any,
+    other_px: Any,
+    sigma_other: Any,
+    pixel_of_canvas: Any,
+    x: Any,
+    line: Any,
+    index: Any,
+    limits: Any,
+    rows: Any,
+    tile: Any,
+    reasons: Any,
+) -> Any:
+    """Find the partners of one row: rows 0, 1 and 2 become x, slope and variance."""
+    width = reference_row.size
+    found, slope, variance, start, second = rows[0], rows[1], rows[2], rows[3], rows[4]
+    again = rows[5]
+    two_places = _start_row(reference_row, x, line, index, limits, start, second, reasons)
+    for begin in range(0, width, _TILE):
+        end = min(begin + _TILE, width)
+        _first_step(
+            other_px,
+            sigma_other,
+            pixel_of_canvas,
+            reference_row[begin:end],
+            start[begin:end],
+            line[begin:end],
+            limits.jump,
+            tile,
+            found[begin:end],
+            slope[begin:end],
+            variance[begin:end],
+            again[begin:end],
+        )
+    jump = limits.jump
+    _refine_row(
+        other_px,
+        sigma_other,
+        pixel_of_canvas,
+        reference_row,
+        again,
+        line,
+        jump,
+        found,
+        slope,
+        variance,
+    )
+    if two_places:
+        x2, slope2, variance2 = rows[6], rows[7], rows[8]
+        x2[:] = _EMPTY
+        _refine_row(
+            other_px,
+            sigma_other,
+            pixel_of_canvas,
+            reference_row,
+            second,
+            line,
+            jump,
+            x2,
+            slope2,
+            variance2,
+        )
+        _choose_row(second, found, slope, variance, x2, slope2, variance2, reasons)
 
 
 @kernel
@@ -515,68 +782,38 @@ def _match_rows(
     sigma_other: Any,
     nodes: Any,
     pixel_of_canvas: Any,
-    corner: Any,
-    index_reference: Any,
-    index_other: Any,
+    index: Any,
     limits: Any,
     out_x: Any,
     out_sigma: Any,
-    out_slope: Any,
     out_reasons: Any,
 ) -> None:
     height, width = reference_px.shape
     known = np.int64(1 if sigma_reference.shape[0] == height else 0)
     for row in numba.prange(height):
-        xs = np.empty((10, width), np.float64)
+        rows = np.empty((11, width), np.float32)
+        tile = _Rows(np.empty((8, _TILE), np.float32), np.empty(_TILE, np.int32))
         work = np.empty(nodes.shape[2], np.float64)
-        x, line, start, second = xs[0], xs[1], xs[2], xs[3]
-        found, slope, variance = xs[4], xs[5], xs[6]
+        x, line = rows[9], rows[10]
         lattice_row(nodes[0], row, work, x)
         lattice_row(nodes[1], row, work, line)
-        line -= corner[1]
-        targets = reference_px[row]
-        two_places = _start_row(
-            targets, x, line, index_reference, index_other, limits, start, second, out_reasons[row]
-        )
-        _refine_row(
+        line -= limits.y0
+        _match_row(
+            reference_px[row],
             other_px,
             sigma_other,
             pixel_of_canvas,
-            targets,
-            start,
+            x,
             line,
-            corner[0],
-            limits[2],
-            found,
-            slope,
-            variance,
-        )
-        if two_places:
-            _refine_row(
-                other_px,
-                sigma_other,
-                pixel_of_canvas,
-                targets,
-                second,
-                line,
-                corner[0],
-                limits[2],
-                xs[7],
-                xs[8],
-                xs[9],
-            )
-            _choose_row(second, found, slope, variance, xs[7], xs[8], xs[9], out_reasons[row])
-        _finish_row(
-            targets,
-            sigma_reference[np.int64(row) * known],
-            found,
-            slope,
-            variance,
-            out_x[row],
-            out_sigma[row],
-            out_slope[row],
+            index,
+            limits,
+            rows,
+            tile,
             out_reasons[row],
         )
+        sigma = sigma_reference[np.int64(row) * known]
+        _finish_row(rows[0], rows[1], sigma, rows[2], limits.x0, out_x[row], out_sigma[row])
+        _explain_row(reference_px[row], rows[0], out_reasons[row])
 
 
 @row_loop

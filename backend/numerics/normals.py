@@ -124,7 +124,7 @@ def _fit_whole(own: Any, sums: Any, middle: Any, limit: Any, gradient: Any) -> A
         most = limit * own[n]
         # a missing neighbour may escape the range but makes the sum NaN
         same = (highest - here <= most) & (here - lowest <= most) & (total == total)
-        whole += np.int64(1 if same else 0)
+        whole += 1 if same else 0
         gradient[0, n] = across * np.float32(1 / 50)
         gradient[1, n] = down * np.float32(1 / 50)
         gradient[2, n] = total * np.float32(1 / 25) - here

@@ -79,9 +79,7 @@ def test_depth_noise_grows_with_distance_squared_and_falls_with_the_baseline():
         columns = pair.rectified_of_reference.map()[0]
         for depth in (500.0, 1000.0):
             x_other = (columns - pair.focal_px * base / depth).astype(np.float32)
-            cloud = triangulate_pair(
-                Matches(x_other, sigma, sigma, np.zeros((48, 64), np.uint16)), pair
-            )
+            cloud = triangulate_pair(Matches(x_other, sigma, np.zeros((48, 64), np.uint16)), pair)
             found[base, depth] = cloud.sigma_mm[19, 34]  # on the axis
     assert found[50, 1000] / found[50, 500] == pytest.approx(4, rel=1e-3)
     assert found[50, 1000] / found[100, 1000] == pytest.approx(2, rel=1e-3)

@@ -72,9 +72,7 @@ def test_any_point_comes_back_from_two_rectified_columns(x, y, z, swap, base, ro
     other = np.full(ref.shape[1:], np.nan, np.float32)
     other[row, column] = focal * in_plane[0] / in_plane[2]
     nothing = np.full_like(other, 0.1)
-    cloud = triangulate_pair(
-        Matches(other, nothing, nothing, np.zeros(other.shape, np.uint16)), pair
-    )
+    cloud = triangulate_pair(Matches(other, nothing, np.zeros(other.shape, np.uint16)), pair)
     # float32 rectified columns, seen through the depth's sensitivity
     tolerance = 3e-4 * z * z / (focal * base) + 1e-3
     assert cloud.points_mm[row, column] == pytest.approx(point, abs=tolerance)
@@ -95,7 +93,7 @@ def test_points_behind_the_cameras_are_none():
     pair = rectify(device, device, RigidTransform(np.eye(3), np.array([-100.0, 0, 0])))
     far_right = np.full((64, 96), 500, np.float32)
     ones = np.ones_like(far_right)
-    cloud = triangulate_pair(Matches(far_right, ones, ones, np.zeros((64, 96), np.uint16)), pair)
+    cloud = triangulate_pair(Matches(far_right, ones, np.zeros((64, 96), np.uint16)), pair)
     assert np.isnan(cloud.points_mm).all()
     assert np.isnan(cloud.sigma_mm).all()
 
