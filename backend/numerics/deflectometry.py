@@ -298,6 +298,35 @@ def solve_slopes(
     return MirrorSlopes(points, slopes, surface, pose, tilt_rad)
 
 
+def follow_deviation(
+    view: View, found: MirrorSlopes, deviation_mm: Float[np.ndarray, "n"]
+) -> MirrorSlopes:
+    r"""Move the points from the fitted polynomial to the surface itself, and find their slopes anew.
+
+    Parameters
+    ----------
+    view
+        As given to `solve_slopes`.
+    found
+        Its result, or that of this function.
+    deviation_mm
+        Height of the surface above the polynomial at each pixel's point; NaN: the point stays.
+
+    Notes
+    -----
+    A point at height h above the polynomial lies on its ray :math:`h / (d_z - s \cdot d_{xy})` farther: exact for
+    a surface that is parallel to the polynomial, else to second order in h over its lateral scale.
+    """
+    pose = found.mirror_from_world
+    along = view.directions @ pose.R.T
+    base = intersect(pose.t_mm, along, found.fit)
+    steep = found.fit.slopes(base[:, 0], base[:, 1])
+    facing = along[:, 2] - (steep * along[:, :2]).sum(axis=1)
+    points = base + (np.nan_to_num(deviation_mm) / facing)[:, None] * along
+    slopes = reflection_slopes(points, pose.t_mm, view.screen_mm @ pose.R.T + pose.t_mm)
+    return found._replace(points_mm=points, slopes=slopes)
+
+
 def _slopes_of(
     view: View, pose: RigidTransform, surface: Surface
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]:

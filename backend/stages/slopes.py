@@ -22,6 +22,7 @@ from backend.numerics.deflectometry import (
     MirrorSlopes,
     Surface,
     View,
+    follow_deviation,
     paraboloid,
     plane,
     solve_slopes,
@@ -30,6 +31,7 @@ from backend.numerics.errors import NumericsError, ScreenError
 from backend.numerics.height_grid import HeightGrid
 from backend.numerics.mirror_pose import circle_outline, pose_from_markers, pose_from_outline
 from backend.numerics.screen_surface import ScreenSurface, screen_surface
+from backend.numerics.slope_integration import integrate_slopes
 from backend.numerics.surface_maps import curvature
 from backend.stages.rig_geometry import from_reference, require_camera
 from backend.stages.screen_phase import ScreenPhase
@@ -40,6 +42,10 @@ Marker = Annotated[
     tuple[float, float, float, float, float], "column and row in px; x, y, z on the mirror in mm"
 ]
 Corner = Annotated[tuple[float, float], "x, y on the mirror in mm"]
+
+_MOST_ROUNDS = 5
+_SETTLED_SHARE = 1e-6
+"""Heights wrong by this part of the camera's distance turn slopes by about 0.1 urad."""
 
 DEFAULT_FOCAL_MM = 1e5
 """Nearly flat: where a parabola starts if nothing else is said."""
@@ -176,7 +182,9 @@ def slopes(
             robust=params.robust,
             alignment=scene.alignment(params, aligned, load),
         )
-        progress(0.7, "errors and curvature")
+        progress(0.5, "the surface beyond the polynomial")
+        found = scene.follow(found)
+        progress(0.8, "errors and curvature")
         design = _design(params, found, load)
     except ScreenError as error:
         raise InvalidCalibrationError(f"{str(error)[0].upper()}{str(error)[1:]}.") from error
@@ -274,6 +282,29 @@ class _Scene:
         middle = to_camera.R @ self.screen.middle_mm + to_camera.t_mm
         return pose_from_outline(self.mirror, outline, self.model, middle)
 
+    def spread(self, values: Float[np.ndarray, "n"]) -> Float64[np.ndarray, "h w"]:
+        """Put values of the pixels with a place on the screen into a map."""
+        full = np.full(self.places.shape, np.nan)
+        full[self.places] = values
+        return full
+
+    def follow(self, found: MirrorSlopes) -> MirrorSlopes:
+        """Integrate what the polynomial leaves and move the points there, until that changes nothing."""
+        deviation_mm = np.zeros(len(found.points_mm))
+        settled_mm = _SETTLED_SHARE * float(np.linalg.norm(found.mirror_from_world.t_mm))
+        for _ in range(_MOST_ROUNDS):
+            x, y = found.points_mm[:, 0], found.points_mm[:, 1]
+            rest = found.slopes - found.fit.slopes(x, y)
+            parts = (x, y, rest[:, 0], rest[:, 1])
+            height = integrate_slopes(*map(self.spread, parts), tolerance=1e-4).height_mm
+            before, deviation_mm = deviation_mm, height[self.places]
+            # Slopes don't tell heights: the surface goes through the polynomial where the mirror's origin is.
+            deviation_mm = deviation_mm - deviation_mm[np.nanargmin(np.hypot(x, y))]
+            if np.nanmax(np.abs(deviation_mm - before)) < settled_mm:
+                break
+            found = follow_deviation(self.view, found, deviation_mm)
+        return found
+
     def alignment(self, params: SlopesParams, aligned: bool, load: LoadArray) -> Alignment | None:
         """Say what of the pose is adjusted."""
         if not aligned:
@@ -349,11 +380,7 @@ def _describe(
     aligned: bool,
     params: SlopesParams,
 ) -> Slopes:
-    def spread(values: Float[np.ndarray, "n"]) -> Float64[np.ndarray, "h w"]:
-        full = np.full(scene.places.shape, np.nan)
-        full[scene.places] = values
-        return full
-
+    spread = scene.spread
     points = np.full((*scene.places.shape, 3), np.nan, np.float32)
     points[scene.places] = found.points_mm
     slope_x, slope_y = spread(found.slopes[:, 0]), spread(found.slopes[:, 1])

@@ -114,6 +114,8 @@ def surface(slopes: Slopes, params: SurfaceParams, progress: Progress) -> Surfac
     progress(0.7, "terms")
     height = rest.height_mm
     height[known] += base.heights(x[known], y[known])
+    # Slopes don't tell heights: those at which the rays were met do.
+    height += np.nanmedian(points[..., 2] - height)
     error = 1e3 * (height - slopes.design_mm[name])
     error = _levelled(error, x, y, params.without_tilt)
     finite = error[np.isfinite(error)]
