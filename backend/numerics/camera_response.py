@@ -155,6 +155,11 @@ class ResponseProblem:
         curve = self._basis @ coefficients
         return np.asarray(curve - curve[mid_gray(self.levels)], np.float64)
 
+    def determined(self, lowest_gray: int, highest_gray: int) -> bool:
+        """Tell whether samples between two gray levels determine a curve: twice as many points as its degree."""
+        inside = (self._gray >= lowest_gray) & (self._gray <= highest_gray) & (self._used > 0)
+        return int((inside.sum(axis=1) >= 2).sum()) >= 2 * self.degree
+
     def residual(self, curve: Float[np.ndarray, "level"], *, lowest_gray: int = 0) -> float:
         """Return the rms of g(G) - ln E - ln dt over the samples used, i.e. the relative error of the light."""
         used = self._used * (self._gray >= lowest_gray)

@@ -56,6 +56,7 @@ class Interval:
             "U over darkest (across) and brightest gray level (down)",
             unit="%",
             colormap="viridis",
+            high=30.0,
             x="axis_gray",
             y="axis_gray",
             point="chosen_gray",

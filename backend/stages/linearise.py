@@ -77,8 +77,6 @@ class PredictedError:
     noise_mrad: float
     quoted_error_percent: float
     """Largest departure from the straight line over the range that the fringes use."""
-    control_low: float
-    control_high: float
 
 
 @dataclass(frozen=True)
@@ -241,8 +239,6 @@ def _row(name: str, shown: Shown, error: PhaseError) -> PredictedError:
         systematic_mrad=1e3 * error.shape_rad,
         noise_mrad=1e3 * error.noise_rad,
         quoted_error_percent=float(np.abs(shown.quoted).max()),
-        control_low=shown.fringes.control_low,
-        control_high=shown.fringes.control_high,
     )
 
 
