@@ -84,13 +84,13 @@ def decode_line_shift(
     patterns: Sequence[Shaped[np.ndarray, "h w"]],
     inverses: Sequence[Shaped[np.ndarray, "h w"]],
     stripes: Stripes,
-    coarse_px: Float32[np.ndarray, "h w"],
+    coarse_px: Float32[np.ndarray, "coarse_h coarse_w"],
     *,
     size_px: int,
     noise: NoiseModel,
     limits: LineShiftLimits | None = None,
     mask: Float[np.ndarray, "across along"] | None = None,
-    across_px: Float32[np.ndarray, "h w"] | None = None,
+    across_px: Float32[np.ndarray, "coarse_h coarse_w"] | None = None,
 ) -> LineShift:
     r"""Find the projector coordinate of every pixel from stripes that are shifted over it.
 
@@ -184,7 +184,7 @@ def _checked(
     patterns: Sequence[Shaped[np.ndarray, "h w"]],
     inverses: Sequence[Shaped[np.ndarray, "h w"]],
     stripes: Stripes,
-    coarse_px: Float32[np.ndarray, "h w"],
+    coarse_px: Float32[np.ndarray, "coarse_h coarse_w"],
 ) -> Any:
     n = stripes.shifts
     if len(patterns) != n or len(inverses) != n:
