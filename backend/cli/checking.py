@@ -1,8 +1,6 @@
-"""`unglare check-rig`: are all devices there, and do they see light."""
+"""`unglare rigs check`: are all devices there, and do they see light."""
 
 from typing import TYPE_CHECKING
-
-import typer
 
 from backend.cli.house import open_services
 from backend.cli.options import (
@@ -19,11 +17,6 @@ from backend.cli.output import answering, console, quiet_logging, table
 
 if TYPE_CHECKING:
     from backend.services.rig_trial import RigTrial
-
-
-def register(application: typer.Typer) -> None:
-    """Add the commands of this module."""
-    application.command("check-rig")(check_rig)
 
 
 def check_rig(

@@ -68,7 +68,7 @@ class RigOffer(Message):
 
 
 class RigCheck(Message):
-    """What `check-rig` found."""
+    """What `rigs check` found."""
 
     name: str
     ok: bool

@@ -71,7 +71,7 @@ def try_rig(context: Context, name: str, options: Mapping[str, Any]) -> RigTrial
     UnglareError
         If the rig can't be opened, is busy, or a device fails: the sentence names it.
     """
-    with context.rigs.lease(name, options, Owner("", "check", "check-rig")) as lease:
+    with context.rigs.lease(name, options, Owner("", "check", "rigs check")) as lease:
         return lease.call(lambda rig: _try(name, rig))
 
 

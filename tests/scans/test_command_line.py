@@ -237,7 +237,7 @@ def test_a_methods_settings_are_listed_with_what_is_allowed(unglare):
 
 
 def test_a_healthy_rig_has_no_problems(unglare):
-    done = unglare("check-rig", *SMALL, "--json")
+    done = unglare("rigs", "check", *SMALL, "--json")
     assert done.status == 0, done.err
     assert done.answer["ok"]
     assert {f["camera"] for f in done.answer["frames"]} == {"left", "right"}
@@ -255,7 +255,7 @@ def test_a_healthy_rig_has_no_problems(unglare):
 )
 def test_a_rigs_problem_is_named(unglare, option, words):
     done = unglare(
-        "check-rig", *SMALL, "--rig-option", option, "--rig-option", "fail_for_good=true", "--json"
+        "rigs", "check", *SMALL, "--rig-option", option, "--rig-option", "fail_for_good=true", "--json"
     )
     assert done.status == 1
     assert words in done.answer["error"]

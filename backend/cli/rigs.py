@@ -1,0 +1,82 @@
+"""`unglare rigs`: which rigs this station has, the files that describe them, and whether a rig works."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from backend.cli.checking import check_rig
+from backend.cli.options import AsJson, DataFolder
+from backend.cli.output import answering, console, quiet_logging, table
+
+if TYPE_CHECKING:
+    from backend.devices.rig_shelf import RigShelf
+
+
+def register(application: typer.Typer) -> None:
+    """Add the commands of this module."""
+    group = typer.Typer(
+        name="rigs",
+        help="The station's rigs: built in, from packages, and described by files.",
+        no_args_is_help=True,
+    )
+    group.command("list")(list_rigs)
+    group.command("add")(add)
+    group.command("remove")(remove)
+    group.command("check")(check_rig)
+    application.add_typer(group)
+
+
+def list_rigs(data: DataFolder = None, as_json: AsJson = False) -> None:
+    """List every rig that scans can be made with, and why one can't be used."""
+    from backend.cli.house import open_services
+
+    quiet_logging()
+    with answering(as_json) as answer, open_services(data) as services:
+        offers = services.rigs()
+        answer["rigs"] = [offer.model_dump(mode="json") for offer in offers]
+    if as_json:
+        return
+    rows = table("name", "title", "from")
+    for offer in offers:
+        rows.add_row(offer.name, offer.title, offer.error or offer.doc)
+    console().print(rows)
+
+
+def add(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Rig file (YAML).")],
+    name: Annotated[str, typer.Option(help="Name of the rig; else the file's.")] = "",
+    data: DataFolder = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check a rig file and keep it; scans can then be made with --rig NAME."""
+    quiet_logging()
+    with answering(as_json) as answer:
+        kept = _shelf(data).add(file, name)
+        answer.update({"name": kept.name, "path": str(kept.path)})
+        if not as_json:
+            console().print(
+                f"rig {kept.name} is kept in {kept.path}; try it: unglare rigs check --rig {kept.name}"
+            )
+
+
+def remove(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the rig.")],
+    data: DataFolder = None,
+    as_json: AsJson = False,
+) -> None:
+    """Take a rig file away; it is renamed, not deleted."""
+    quiet_logging()
+    with answering(as_json) as answer:
+        left = _shelf(data).remove(name)
+        answer.update({"name": name, "path": str(left)})
+        if not as_json:
+            console().print(f"rig {name} is no longer offered; its file is {left}")
+
+
+def _shelf(data: Path | None) -> "RigShelf":
+    from backend.devices.pages import PageDesk
+    from backend.devices.rig_shelf import RigShelf
+    from backend.settings import load_settings
+
+    return RigShelf(load_settings(data_folder=data).rig_folder, PageDesk())

@@ -1,0 +1,154 @@
+"""Rig files: what is in them, what is refused, and how drivers are found."""
+
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from backend.devices import driver_loading
+from backend.devices.drivers.aravis_camera import AravisCamera
+from backend.devices.drivers.page_projector import PageProjector
+from backend.devices.errors import RigConfigError, RigNotFoundError
+from backend.devices.pages import PageDesk
+from backend.devices.rig_file import RigFile, assemble
+from backend.devices.rig_shelf import RigShelf
+
+BENCH = """
+title: Bench by the window
+cameras:
+  left:  {driver: aravis, address: 192.0.2.2, sensor: {full_well_e: 10500, read_noise_e: 6.5}}
+  right: {driver: aravis, address: 192.0.2.3}
+projector: {driver: page, size: 1280x800, refresh_hz: 60, settle_ms: 17, gamma: 2.2}
+"""
+VIEW = "{width_px: 64, height_px: 48, K: [[60, 0, 32], [0, 60, 24], [0, 0, 1]]%s}"
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> RigShelf:
+    return RigShelf(tmp_path / "rigs", PageDesk())
+
+
+def written(folder: Path, text: str, name: str = "bench.yaml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_a_rig_is_made_of_its_file(tmp_path: Path, shelf: RigShelf) -> None:
+    kept = shelf.add(written(tmp_path, BENCH))
+    rig = shelf.open(kept.name, {})
+    assert rig.name == "bench"
+    assert list(rig.cameras) == ["left", "right"]
+    assert all(isinstance(camera, AravisCamera) for camera in rig.cameras.values())
+    assert isinstance(rig.projector, PageProjector)
+    assert rig.projector.capabilities.size == (1280, 800)
+    assert rig.calibration() is None
+
+
+def test_names_of_the_shelf_come_first_and_others_still_open(shelf: RigShelf) -> None:
+    assert shelf.kept() == ()
+    assert shelf.open("simulated", {"scene": "plane"}).name == "simulated"
+    with pytest.raises(RigNotFoundError, match="nowhere"):
+        shelf.open("nowhere", {})
+
+
+def test_a_removed_file_is_renamed(tmp_path: Path, shelf: RigShelf) -> None:
+    shelf.add(written(tmp_path, BENCH), "line-2")
+    left = shelf.remove("line-2")
+    assert left.read_text() == BENCH
+    assert shelf.kept() == ()
+    with pytest.raises(RigNotFoundError, match="'line-2'"):
+        shelf.remove("line-2")
+
+
+@pytest.mark.parametrize("name", ["simulated", "Bench", "../bench", "a b"])
+def test_names_that_are_taken_or_none_are_refused(
+    name: str, tmp_path: Path, shelf: RigShelf
+) -> None:
+    with pytest.raises(RigConfigError, match=name.replace(".", r"\.")):
+        shelf.add(written(tmp_path, BENCH), name)
+    assert shelf.kept() == ()
+
+
+def test_an_edited_file_counts_at_once(tmp_path: Path, shelf: RigShelf) -> None:
+    kept = shelf.add(written(tmp_path, BENCH))
+    kept.path.write_text(BENCH.replace("1280x800", "1920x1080"))
+    assert shelf.open("bench", {}).projector.capabilities.size == (1920, 1080)
+
+
+def test_options_of_a_described_rig_are_refused(tmp_path: Path, shelf: RigShelf) -> None:
+    shelf.add(written(tmp_path, BENCH))
+    with pytest.raises(RigConfigError, match="takes no options, but got scene"):
+        shelf.open("bench", {"scene": "plane"})
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("cameras: [", "isn't YAML"),
+        ("- 1", "the whole file"),
+        ("cameras: {}\nprojector: {driver: page, size: 64x48}", "cameras: "),
+        (BENCH.replace("driver: aravis, address: 192.0.2.2", "driver: arvis, address: 192.0.2.2"), "left: there is no driver 'arvis'; choose aravis"),
+        (BENCH.replace("address: 192.0.2.3", "adress: 192.0.2.3"), "right: there is no option 'adress'; the options are address"),
+        (BENCH.replace(", address: 192.0.2.3", ""), "right: .*give either the address"),
+        (BENCH.replace("full_well_e: 10500", "full_well_e: -1"), "cameras.left.sensor.full_well_e"),
+        (BENCH.replace("1280x800", "12x8"), "projector: option size"),
+        (BENCH.replace("page,", "beamer,"), "projector: there is no driver 'beamer'; choose page"),
+        (BENCH + "calibration: {cameras: {left: " + VIEW % "" + "}}", "calibration is for cameras \\['left'\\], the rig has"),
+        (BENCH + "calibration: {cameras: {left: " + VIEW % ", R: [[2, 0, 0], [0, 1, 0], [0, 0, 1]]" + "}}", "no rotation"),
+    ],
+)  # fmt: skip
+def test_what_cant_be_used_is_one_sentence(
+    text: str, sentence: str, tmp_path: Path, shelf: RigShelf
+) -> None:
+    with pytest.raises(RigConfigError, match=sentence) as refused:
+        shelf.add(written(tmp_path, text))
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path, shelf: RigShelf) -> None:
+    with pytest.raises(RigConfigError, match=r"lost\.yaml can't be read"):
+        shelf.add(tmp_path / "lost.yaml")
+
+
+def test_the_calibration_is_the_first_cameras_frame() -> None:
+    file = RigFile.of(
+        {
+            "cameras": {n: {"driver": "aravis", "address": "192.0.2.2"} for n in ("a", "b")},
+            "projector": {"driver": "page", "size": "64x48"},
+            "calibration": {
+                "cameras": {n: {"width_px": 64, "height_px": 48, "K": np.eye(3).tolist(), "t_mm": t} for n, t in (("a", (0, 0, 0)), ("b", (-180, 0, 0)))},
+            },
+        },
+        "test",
+    )  # fmt: skip
+    calibration = assemble("test", file, PageDesk()).calibration()
+    assert calibration is not None
+    assert calibration.reference == "a"
+    np.testing.assert_array_equal(calibration.camera_from_world["b"].t_mm, (-180, 0, 0))
+    assert calibration.projector is None
+
+
+def make_broken(name: str, options: dict[str, object]) -> None:
+    raise RuntimeError("no licence")
+
+
+def test_drivers_of_packages_are_found_and_a_broken_one_stops_only_its_rig(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    here = [
+        EntryPoint("acme", f"{__name__}:make_broken", driver_loading.CAMERAS),
+        EntryPoint("gone", "no.such.module:make", driver_loading.CAMERAS),
+    ]
+    monkeypatch.setattr(
+        driver_loading, "entry_points", lambda group: [e for e in here if e.group == group]
+    )
+    assert driver_loading.available_drivers(driver_loading.CAMERAS) == ("aravis", "acme", "gone")
+    with pytest.raises(
+        RigConfigError, match="left: driver acme failed with RuntimeError: no licence"
+    ):
+        driver_loading.make_camera("left", "acme", {})
+    with pytest.raises(RigConfigError, match="left: driver gone can't be loaded"):
+        driver_loading.make_camera("left", "gone", {})
+    assert driver_loading.make_camera("left", "aravis", {"address": "192.0.2.2"}).name == "left"
