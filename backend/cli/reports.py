@@ -95,6 +95,55 @@ def table_iv(
     )
 
 
+@_reports.command(name="masked-fringe")
+def masked_fringe(
+    scene: Scene = "metal",
+    out: Out = None,
+    size: Size = None,
+    projector_size: ProjectorSize = None,
+    seed: Seed = None,
+    rig: RigName = "simulated",
+    rig_options: RigOptions = None,
+    data: DataFolder = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare fringes without mask, under the mask, and under bands of epipolar lines: completeness and error per part."""
+    from backend.services.masked_fringe_report import masked_fringe_report as make
+
+    options = parse_rig_options(
+        rig_options, scene=scene, size=size, projector_size=projector_size, seed=seed
+    )
+    _report(
+        lambda context, progress: make(context, options, rig=rig, progress=progress),
+        out=out,
+        data=data,
+        as_json=as_json,
+        quiet=quiet,
+    )
+
+
+@_reports.command(name="edge-tolerance")
+def edge_tolerance(
+    out: Out = None,
+    draws: Annotated[int, typer.Option(min=100, help="Random edges per gap.")] = 20_000,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    data: DataFolder = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Tell over which saturated gap a stripe's edge can be extrapolated: the error over the gap's width."""
+    from backend.services.edge_tolerance import edge_tolerance as make
+
+    _report(
+        lambda context, progress: make(draws=draws, seed=seed),
+        out=out,
+        data=data,
+        as_json=as_json,
+        quiet=quiet,
+    )
+
+
 def _report(make: Make, *, out: Path | None, data: Path | None, as_json: bool, quiet: bool) -> None:
     """Make a report, write it, show it."""
     from backend.services.report_document import refuse_report_folder, write_report
