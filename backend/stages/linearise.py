@@ -49,6 +49,9 @@ TITLES: Mapping[str, str] = {
     "predistorted": "gray levels of pre-distorted fringes",
 }
 
+MORE_STEPS = (8, 12)
+"""Numbers of steps that the table shows beside the one set."""
+
 DEFAULT: Representation = "inverse"
 _TIE = 1.03
 """The default is kept where nothing else is predicted to be better by more than the prediction's own error."""
@@ -71,10 +74,12 @@ class PredictedError:
 
     representation: str
     error_mrad: float
-    """Mean |phase error| over all phases: shape and noise together."""
+    """Mean |phase error| over all phases at the number of steps set: shape and noise together."""
     systematic_mrad: float
     """The same without noise: what the shape of the response leaves."""
-    noise_mrad: float
+    with_8_steps_mrad: float
+    with_12_steps_mrad: float
+    """The error with more steps, to weigh time against them."""
     quoted_error_percent: float
     """Largest departure from the straight line over the range that the fringes use."""
 
@@ -145,18 +150,24 @@ def linearise(
         candidates = representations(ramp, response, interval)
         screen = _screen_response(ramp, response, facts)
         errors = {
-            name: predict_phase_error(screen, shown.fringes, steps=params.steps)
+            name: {
+                steps: predict_phase_error(screen, shown.fringes, steps=steps)
+                for steps in {params.steps, *MORE_STEPS}
+            }
             for name, shown in candidates.items()
         }
     except NumericsError as error:
         text = str(error)
         raise StageFailedError(f"{text[:1].upper()}{text[1:]}.") from error
-    chosen = params.representation or choose({n: e.all_rad for n, e in errors.items()})
+    at_steps = {name: by_steps[params.steps].all_rad for name, by_steps in errors.items()}
+    chosen = params.representation or choose(at_steps)
     if chosen not in candidates:
         raise StageFailedError(
             f"{TITLES[chosen]} needs an exposure stack, and this scan has none: choose another representation."
         )
-    rows = tuple(_row(name, shown, errors[name]) for name, shown in candidates.items())
+    rows = tuple(
+        _row(name, shown, errors[name], params.steps) for name, shown in candidates.items()
+    )
     return _result(chosen, candidates, rows, ramp, interval, params)
 
 
@@ -232,12 +243,13 @@ def _screen_response(
     return ScreenResponse(ramp.control, ramp.gray, noise, ramp.full_scale_gray)
 
 
-def _row(name: str, shown: Shown, error: PhaseError) -> PredictedError:
+def _row(name: str, shown: Shown, errors: Mapping[int, PhaseError], steps: int) -> PredictedError:
     return PredictedError(
         representation=TITLES[name],
-        error_mrad=1e3 * error.all_rad,
-        systematic_mrad=1e3 * error.shape_rad,
-        noise_mrad=1e3 * error.noise_rad,
+        error_mrad=1e3 * errors[steps].all_rad,
+        systematic_mrad=1e3 * errors[steps].shape_rad,
+        with_8_steps_mrad=1e3 * errors[8].all_rad,
+        with_12_steps_mrad=1e3 * errors[12].all_rad,
         quoted_error_percent=float(np.abs(shown.quoted).max()),
     )
 
