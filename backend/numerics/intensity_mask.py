@@ -103,6 +103,23 @@ def scatter(
     gather.at(into.reshape(-1), place, values[use])
 
 
+def light_at(
+    factor: Float32[np.ndarray, "hp wp"],
+    projector_px: Float32[np.ndarray, "h w"],
+    projector_row_px: Float32[np.ndarray, "h w"],
+) -> Float32[np.ndarray, "h w"]:
+    """Return the factor where each camera pixel looks, interpolated; NaN where that isn't known."""
+    seen = cv2.remap(
+        factor,
+        np.ascontiguousarray(projector_px),
+        np.ascontiguousarray(projector_row_px),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    known = ~(np.isnan(projector_px) | np.isnan(projector_row_px))
+    return np.asarray(np.where(known, seen, np.float32(np.nan)), np.float32)
+
+
 def widen_dark(factor: Float32[np.ndarray, "h w"], radius_px: float) -> Float32[np.ndarray, "h w"]:
     """Grow the dark regions by a radius: the smallest factor within a disc (grey erosion).
 

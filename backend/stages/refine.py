@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Integer, UInt8
 
@@ -17,7 +16,7 @@ from backend.domain.rig import ProjectorFacts, RigCalibration, RigFacts
 from backend.domain.shots import Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Review
-from backend.numerics.intensity_mask import Need
+from backend.numerics.intensity_mask import Need, light_at
 from backend.numerics.unqualified import count_shares, judge_pixels
 from backend.stages.base_exposure import BaseExposure
 from backend.stages.code_map import (
@@ -48,7 +47,7 @@ _STRIPE_PX = 8
 """Period of the stripes that tell whether a pixel has contrast enough to be decoded."""
 _TOO_BRIGHT = 0.6
 """A pixel that saturates under the mask gets so much of its light next: how far it is over isn't known."""
-_BRIGHT_ENOUGH = 0.35
+_BRIGHT_ENOUGH = 0.15
 """A pixel that reaches this share of its target needs no more light."""
 _A_LITTLE_OVER = 1.08
 _MOST_RAISE = 1.5
@@ -298,12 +297,8 @@ class _Refinement:
     ) -> Need:
         """Correct what a pixel can take by what it returned under the mask: I - b = k M P with a new k."""
         camera = self.facts.cameras[name]
-        given = cv2.remap(
-            shown_factor(factor, self.projector),
-            places.projector_px,
-            places.projector_row_px,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
+        given = light_at(
+            shown_factor(factor, self.projector), places.projector_px, places.projector_row_px
         )
         black = self.base.black[name].astype(np.float32)
         signal = np.maximum(white - black, np.float32(1))

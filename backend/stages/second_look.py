@@ -19,6 +19,7 @@ from backend.domain.states import Level, Review
 from backend.numerics.code_certainty import PairGeometry, on_epipolar_line
 from backend.numerics.epipolar_bands import EpipolarLines, epipolar_lines
 from backend.numerics.errors import CalibrationError
+from backend.numerics.intensity_mask import light_at, scatter, widen_dark
 from backend.numerics.second_look import Looks, possible_places, second_light
 from backend.numerics.triangulation import projector_consistency, triangulate_projector
 from backend.stages.base_exposure import BaseExposure
@@ -32,8 +33,12 @@ from backend.stages.rig_geometry import camera_geometry
 _DEPTH_MARGIN_MM = 15.0
 _SURE = 0.005
 """Share of the told pixels at either end of their depths that is left out of the range."""
-_MARGIN_PX = 3.0
+_MARGIN_PX = 2.0
 """By which lit bands are wider than the lines that they are for."""
+_TARGET = 0.85
+"""Share of the full scale that the second look may bring a pixel to."""
+_MOST_RAISE = np.float32(6.0)
+_WIDENED_PX = 1.5
 _UNTOLD, _SECOND_LIGHT, _TOLD_NOW = 1, 2, 3
 LABELS = {
     _UNTOLD: "no code that agrees with the calibration, or none at all",
@@ -161,7 +166,8 @@ class _Look:
         """See who gets light from elsewhere, then code the lines of those, some at a time."""
         whites = yield self._whites()
         grays = [shot[self.name].gray.astype(np.float32) for shot in whites]
-        elsewhere = self._second_light(grays)
+        alone = self._alone(grays)
+        elsewhere = self._second_light(grays[0], alone)
         lit = self.base.lit[self.name]
         wanted = lit & (~self.told | (elsewhere > self.params.second_light))
         if int(np.count_nonzero(wanted)) <= self.params.few * max(1, int(np.count_nonzero(lit))):
@@ -169,9 +175,10 @@ class _Look:
         found: list[_Told] = []
         kept: list[Frame] = []
         depths_mm = self._depths_mm()
+        raised = self._raised(alone, wanted)
         for number in range(self.params.bands):
             pixels = wanted & (self.own == number)
-            factor = self._factor(number, pixels, depths_mm)
+            factor = self._factor(number, raised, pixels, depths_mm)
             if not factor.any():
                 continue
             exposed = yield tuple(self._shot(pattern, factor) for pattern in self.patterns)
@@ -202,11 +209,40 @@ class _Look:
         ]
         return tuple(self._shot(WHITE, part) for part in (factor, *parts))
 
-    def _second_light(self, grays: list[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, "h w"]:
-        alone = np.select([self.own == n for n in range(self.params.bands)], grays[1:])
+    def _alone(self, grays: list[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, "h w"]:
+        """Return every pixel under the look that lights its own lines."""
+        own = np.select([self.own == n for n in range(self.params.bands)], grays[1:])
+        return np.asarray(own, np.float32)
+
+    def _second_light(
+        self, white: Float32[np.ndarray, "h w"], alone: Float32[np.ndarray, "h w"]
+    ) -> Float32[np.ndarray, "h w"]:
         noise_gray = least_contrast_gray(self.facts.cameras[self.name])
         black = self.base.black[self.name].astype(np.float32)
-        return second_light(grays[0], alone.astype(np.float32), black, noise_gray=noise_gray)
+        return second_light(white, alone, black, noise_gray=noise_gray)
+
+    def _raised(
+        self, alone: Float32[np.ndarray, "h w"], wanted: Bool[np.ndarray, "h w"]
+    ) -> Float32[np.ndarray, "hp wp"]:
+        """Give back to the pixels looked at the light that the mask took because of second reflections."""
+        factor = np.asarray(self.mask.factor, np.float32)
+        columns, rows = (
+            m.get(self.name) for m in (self.mask.projector_px, self.mask.projector_row_px)
+        )
+        if columns is None or rows is None:
+            return factor
+        camera = self.facts.cameras[self.name]
+        black = self.base.black[self.name].astype(np.float32)
+        room = np.float32(_TARGET * camera.full_scale_gray) - black
+        signal = np.maximum(alone - black, np.float32(least_contrast_gray(camera)))
+        given = light_at(factor, columns, rows)
+        share = np.where(wanted, given * room / signal, np.float32(np.nan))
+        most = np.full(factor.shape, np.inf, np.float32)
+        scatter(share, columns, rows, into=most)
+        known = np.where(np.isinf(most), np.float32(1), most)
+        widened = np.minimum(widen_dark(known, _WIDENED_PX), most)
+        raised = np.clip(widened, factor, np.minimum(_MOST_RAISE * factor, 1))
+        return np.where(np.isinf(most), factor, raised).astype(np.float32)
 
     def _depths_mm(self) -> tuple[float, float]:
         """Return between which depths surfaces are: those of the pixels told, and a little more."""
@@ -218,7 +254,11 @@ class _Look:
         return max(1.0, float(near) - _DEPTH_MARGIN_MM), float(far) + _DEPTH_MARGIN_MM
 
     def _factor(
-        self, number: int, pixels: Bool[np.ndarray, "h w"], depths_mm: tuple[float, float]
+        self,
+        number: int,
+        raised: Float32[np.ndarray, "hp wp"],
+        pixels: Bool[np.ndarray, "h w"],
+        depths_mm: tuple[float, float],
     ) -> Float32[np.ndarray, "hp wp"]:
         """Light a look's lines, but only as far as its pixels may look: less light, fewer reflections."""
         near_mm, far_mm = depths_mm
@@ -226,7 +266,7 @@ class _Look:
         if not pixels.any() or near_mm >= far_mm:
             return np.zeros(lit.shape, np.float32)
         places = possible_places(pixels, self.pair, near_mm=near_mm, far_mm=far_mm)
-        return np.where(lit & places, self.mask.factor, 0).astype(np.float32)
+        return np.where(lit & places, raised, np.float32(0))
 
     # what is told
 
