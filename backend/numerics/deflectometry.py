@@ -23,6 +23,7 @@ _BISQUARE = 4.685
 _MAD_TO_SIGMA = 1.4826
 _FIT_POINTS = 30_000
 _FIT_ROUNDS = 50
+_LEAST_SPREAD = 1e-9
 
 
 class View(NamedTuple):
@@ -193,8 +194,10 @@ def fit_slopes(
 
 
 def _bisquare(residual: Float[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]:
-    spread = _MAD_TO_SIGMA * np.median(np.abs(residual - np.median(residual, axis=0)), axis=0)
-    u = residual / (_BISQUARE * spread + 1e-15)
+    # From zero, not from the median: a first fit that dirt has moved would leave no pixel near zero.
+    spread = _MAD_TO_SIGMA * np.median(np.abs(residual), axis=0)
+    # Simulated slopes may fit to rounding: without a floor nothing but rounding would decide.
+    u = residual / (_BISQUARE * np.maximum(spread, _LEAST_SPREAD))
     return np.asarray(np.where(np.abs(u) < 1, (1 - u * u) ** 2, 0.0))
 
 
@@ -271,7 +274,7 @@ def solve_slopes(
     chosen = np.flatnonzero(usable)
     chosen = chosen[:: max(1, chosen.size // _FIT_POINTS)]
     sample = View(view.directions[chosen], view.screen_mm[chosen], view.screen_origin_mm)
-    surface, weights, tilt_rad = start, np.ones((chosen.size, 2)), 0.0
+    surface, weights = start, np.ones((chosen.size, 2))
     for _ in range(_MOST_ROUNDS):
         points, slopes = _slopes_of(sample, pose, surface)
         met = np.isfinite(slopes).all(axis=1)
@@ -285,7 +288,6 @@ def solve_slopes(
         change = _change(before, surface, points[met])
         if alignment is not None:
             surface, pose, turned_rad, moved = _aligned(surface, pose, alignment, view)
-            tilt_rad += turned_rad
             change = max(change, turned_rad, moved)
         if change < _SETTLED:
             break
@@ -295,6 +297,7 @@ def solve_slopes(
             "check the poses of screen and mirror"
         )
     points, slopes = _slopes_of(view, pose, surface)
+    tilt_rad = _angle(pose.R @ mirror_from_world.R.T)
     return MirrorSlopes(points, slopes, surface, pose, tilt_rad)
 
 
@@ -367,7 +370,7 @@ def _aligned(
         scale = _distance_scale(pose, alignment, view)
         moved = abs(scale - 1.0)
         pose = RigidTransform(pose.R, pivot + scale * (pose.t_mm - pivot))
-    return turned, pose, float(np.linalg.norm(_rotation_vector(turn))), moved
+    return turned, pose, _angle(turn), moved
 
 
 def _normal(slopes: Float[np.ndarray, "2"]) -> Float64[np.ndarray, "3"]:
@@ -384,18 +387,9 @@ def _rotation(
     return np.asarray(np.eye(3) + skew + skew @ skew / (1 + c))
 
 
-def _rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
-    """Return the axis times the sine of the angle, good for small ones."""
-    return (
-        np.array(
-            [
-                rotation[2, 1] - rotation[1, 2],
-                rotation[0, 2] - rotation[2, 0],
-                rotation[1, 0] - rotation[0, 1],
-            ]
-        )
-        / 2
-    )
+def _angle(rotation: Float[np.ndarray, "3 3"]) -> float:
+    """Return the angle of a rotation in [rad], exact for small ones."""
+    return float(2 * np.arcsin(min(1.0, np.linalg.norm(rotation - np.eye(3)) / np.sqrt(8))))
 
 
 def _distance_scale(pose: RigidTransform, alignment: Alignment, view: View) -> float:
