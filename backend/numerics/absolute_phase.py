@@ -12,9 +12,8 @@ from backend.numerics.errors import FrameError, FrequencyError
 from backend.numerics.fringe_orders import FringeOrders, hierarchical
 from backend.numerics.kernels import frame_stack, kernel_input, new_work
 from backend.numerics.order_rows import CODE
-from backend.numerics.phasors import Phasors, steps_of
+from backend.numerics.phasors import Phasors, averaging_steps_of, exposure_table
 from backend.numerics.sine_code import SineCode
-from backend.numerics.sinusoid_rows import Steps
 from backend.numerics.uncertainty import NoiseModel
 
 
@@ -45,10 +44,16 @@ class AbsolutePhase(NamedTuple):
     """Predicted standard deviation of `projector_px`, NaN where that is NaN."""
     margin_cycles: Float32[np.ndarray, "h w"] | None
     """By how much the second-nearest fringe order is further away; NaN where a chain was used."""
+    wrapped_rad: Float32[np.ndarray, "h w"] | None = None
+    """Phase of the highest frequency in [rad], in (-pi, pi]; NaN where there is no phasor."""
 
 
 def empty_maps(
-    shape: tuple[int, int], *, with_sigma: bool = False, with_margin: bool = False
+    shape: tuple[int, int],
+    *,
+    with_sigma: bool = False,
+    with_margin: bool = False,
+    with_wrapped: bool = False,
 ) -> AbsolutePhase:
     """Allocate maps that several decodings may reuse: touching new memory costs as much as decoding."""
     return AbsolutePhase(
@@ -58,6 +63,7 @@ def empty_maps(
         reasons=np.empty(shape, np.uint16),
         sigma_px=np.empty(shape, np.float32) if with_sigma else None,
         margin_cycles=np.empty(shape, np.float32) if with_margin else None,
+        wrapped_rad=np.empty(shape, np.float32) if with_wrapped else None,
     )
 
 
@@ -126,7 +132,7 @@ def decode_frames(
         stack.addresses,
         stack.wide,
         stack.shape[0] * stack.shape[1],
-        _with_average(steps_of(code)),
+        averaging_steps_of(code),
         _coarse(orders, coarse_px, stack.shape),
         float(saturation_gray),
         kernels.Noise(
@@ -149,9 +155,9 @@ def absolute_phase(
     *,
     size_px: int,
     limits: Limits | None = None,
-    black_gray: float = 0.0,
     coarse_px: Float32[np.ndarray, "h w"] | None = None,
     with_margin: bool = False,
+    with_wrapped: bool = False,
     out: AbsolutePhase | None = None,
 ) -> AbsolutePhase:
     r"""Find the projector coordinate of each pixel from its phasors.
@@ -168,14 +174,12 @@ def absolute_phase(
         Projector's width (or height, for fringes along y) in [px].
     limits
         Which pixels are accepted.
-    black_gray
-        Gray level of no light in [gray], to tell dark from low contrast.
     coarse_px
         Projector coordinate from a Gray code, NaN where it has none; for `code_aided` orders only.
-    with_margin
-        Also give `margin_cycles`.
+    with_margin, with_wrapped
+        Also give `margin_cycles` or `wrapped_rad`.
     out
-        Maps to write to, from `empty_maps` with sigma; wins over `with_margin`.
+        Maps to write to, from `empty_maps` with sigma; wins over `with_margin` and `with_wrapped`.
 
     Returns
     -------
@@ -197,22 +201,29 @@ def absolute_phase(
     of a projector pixel at 60 periods over 1280 columns; float32 leaves 6e-5 px.
     """
     shape = phasors.reasons.shape
-    if phasors.in_phase_gray.shape != (len(code.periods), *shape):
+    if phasors.in_phase.shape != (len(code.periods), *shape):
         raise FrameError(
-            f"phasors of shape {phasors.in_phase_gray.shape} don't fit {len(code.periods)} "
+            f"phasors of shape {phasors.in_phase.shape} don't fit {len(code.periods)} "
             f"frequencies of {shape}: give the code that the phasors were fused with"
         )
-    maps = out or empty_maps(shape, with_sigma=True, with_margin=with_margin)
+    maps = out or empty_maps(
+        shape, with_sigma=True, with_margin=with_margin, with_wrapped=with_wrapped
+    )
     _check_maps(maps, shape, True)
-    settings = _settings(code, orders, limits or Limits(), size_px, black_gray)
+    settings = _settings(code, orders, limits or Limits(), size_px, 0.0)
     n_frequencies = len(code.periods)
     kernels.locate_phasors(
         new_work(),
-        kernel_input(phasors.in_phase_gray).reshape(n_frequencies, -1),
-        kernel_input(phasors.quadrature_gray).reshape(n_frequencies, -1),
-        kernel_input(phasors.mean_gray).reshape(n_frequencies, -1),
-        kernel_input(phasors.sigma_gray).reshape(-1),
-        kernel_input(phasors.reasons).reshape(-1),
+        kernels.Planes(
+            kernel_input(phasors.in_phase).reshape(n_frequencies, -1),
+            kernel_input(phasors.quadrature).reshape(n_frequencies, -1),
+            kernel_input(phasors.light_gray_per_ms).reshape(-1),
+            kernel_input(phasors.sigma_gray).reshape(-1),
+            kernel_input(phasors.exposure_index).reshape(-1),
+            kernel_input(phasors.reasons).reshape(-1),
+            exposure_ms=exposure_table(phasors.exposures_ms),
+            step_gray=float(phasors.step_gray),
+        ),
         _coarse(orders, coarse_px, shape),
         orders.tables,
         settings.scales,
@@ -220,13 +231,6 @@ def absolute_phase(
         _kernel_maps(maps),
     )
     return maps
-
-
-def _with_average(steps: Steps) -> Steps:
-    """Scale the means' weights so that all frequencies' means add up to their average."""
-    n_frequencies = steps.first_frame.size - 1
-    scale = np.array([[1.0], [1.0], [1 / n_frequencies]], dtype=np.float32)
-    return steps._replace(weights=steps.weights * scale)
 
 
 class _Settings(NamedTuple):
@@ -262,6 +266,7 @@ def _settings(
             guard_band=float(limits.guard_band),
             size_px=float(size_px),
             black_gray=float(black_gray),
+            finest=int(np.argmax(frequencies)),
         ),
     )
 
@@ -307,6 +312,7 @@ def _kernel_maps(maps: AbsolutePhase) -> kernels.Maps:
         residual_cycles=maps.residual_cycles.reshape(-1),
         margin_cycles=nothing if maps.margin_cycles is None else maps.margin_cycles.reshape(-1),
         sigma_px=nothing if maps.sigma_px is None else maps.sigma_px.reshape(-1),
+        wrapped_rad=nothing if maps.wrapped_rad is None else maps.wrapped_rad.reshape(-1),
         reasons=maps.reasons.reshape(-1),
     )
 
@@ -317,8 +323,15 @@ def warm_up_kernels() -> None:
     orders = hierarchical(code.periods)
     frames = [np.zeros((1, 1), np.uint8)] * 4
     decode_frames(frames, code, orders, size_px=1, saturation_gray=255.0)
-    plane, picture = np.zeros((1, 1, 1), np.float32), np.zeros((1, 1), np.float32)
+    steps, picture = np.zeros((1, 1, 1), np.int16), np.zeros((1, 1), np.float32)
     phasors = Phasors(
-        plane, plane, plane, picture, picture.astype(np.uint8), *[picture.astype(np.uint16)] * 2
+        steps,
+        steps,
+        picture,
+        picture,
+        picture.astype(np.uint8),
+        picture.astype(np.uint16),
+        step_gray=1.0,
+        exposures_ms=(1.0,),
     )
     absolute_phase(phasors, code, orders, size_px=1)

@@ -27,7 +27,6 @@ from backend.numerics.sinusoid_rows import (
     TILE,
     ZERO,
     add_inverse,
-    average,
     demodulate,
     fill,
     keep_smallest,
@@ -56,6 +55,8 @@ class Limits(NamedTuple):
     guard_band: float
     size_px: float
     black_gray: float
+    finest: int
+    """Number of the highest frequency."""
 
 
 class Noise(NamedTuple):
@@ -145,15 +146,49 @@ class Maps(NamedTuple):
     residual_cycles: Any  # float32[p]
     margin_cycles: Any  # float32[p] or [0]
     sigma_px: Any  # float32[p] or [0]
+    wrapped_rad: Any  # float32[p] or [0]
     reasons: Any  # uint16[p]
+
+
+class Planes(NamedTuple):
+    """Phasors, as `fusion_kernels.Fused` leaves them."""
+
+    cosine: Any  # int16[k, p]
+    sine: Any  # int16[k, p]
+    light: Any  # float32[p]
+    sigma_gray: Any  # float32[p]
+    exposure_index: Any  # uint8[p]
+    reasons: Any  # uint16[p]
+    exposure_ms: Any  # float32[256]
+    step_gray: float
+
+
+@row_loop
+def _to_gray(steps: Any, step_gray: Any, gray: Any) -> None:
+    for i in range(gray.size):
+        gray[i] = np.float32(steps[i]) * step_gray
+
+
+@row_loop
+def _mean_of(light: Any, index: Any, exposure_ms: Any, mean: Any) -> None:
+    """Mean above black in the gray levels of the exposure used."""
+    for i in range(mean.size):
+        mean[i] = light[i] * exposure_ms[index[i]]
+
+
+_TURN = np.float32(2 * np.pi)
+
+
+@row_loop
+def _store_wrapped(cycles: Any, reasons: Any, wrapped: Any) -> None:
+    for i in range(wrapped.size):
+        turn = cycles[i] - ONE if cycles[i] > HALF else cycles[i]
+        wrapped[i] = turn * _TURN if reasons[i] == VALID else NAN
 
 
 @row_loop
 def _locate_tile(
     rows: Any,
-    cosine: Any,
-    sine: Any,
-    first: Any,
     mean: Any,
     variance: Any,
     coarse_px: Any,
@@ -172,13 +207,13 @@ def _locate_tile(
     with_sigma = maps.sigma_px.size > 0
     fill(smallest, np.float32(np.inf))
     fill(inverse, ZERO)
-    for k in range(cosine.shape[0]):
-        to_cycles(
-            cosine[k, first : first + n], sine[k, first : first + n], rows.cycles[k, :n], power
-        )
+    for k in range(rows.cosine.shape[0]):
+        to_cycles(rows.cosine[k, :n], rows.sine[k, :n], rows.cycles[k, :n], power)
         keep_smallest(power, smallest)
         if with_sigma and scales[1, k] > ZERO:
             add_inverse(power, scales[1, k], inverse)
+    if maps.wrapped_rad.size > 0:
+        _store_wrapped(rows.cycles[limits.finest, :n], reasons, maps.wrapped_rad[start : start + n])
     _judge_light(
         mean,
         np.float32(limits.black_gray),
@@ -253,9 +288,6 @@ def _decode_share(
             )
         _locate_tile(
             rows,
-            rows.cosine,
-            rows.sine,
-            0,
             mean,
             variance,
             coarse_px,
@@ -304,73 +336,33 @@ def decode_frames(
 
 @row_loop
 def _locate_share(
-    counter: Any,
-    cosine: Any,
-    sine: Any,
-    mean: Any,
-    sigma_gray: Any,
-    known_reasons: Any,
-    coarse_px: Any,
-    orders: Any,
-    scales: Any,
-    limits: Any,
-    maps: Any,
+    counter: Any, planes: Any, coarse_px: Any, orders: Any, scales: Any, limits: Any, maps: Any
 ) -> None:
-    n_px = known_reasons.size
-    rows = new_rows(cosine.shape[0])
+    n_px = planes.reasons.size
+    rows = new_rows(planes.cosine.shape[0])
+    step_gray = np.float32(planes.step_gray)
     start = TILE * take_next(counter)
     while start < n_px:
         n = min(TILE, n_px - start)
         end = start + n
-        mean_row, variance = rows.single[10, :n], rows.single[11, :n]
-        average(mean, start, mean_row)
-        widen(known_reasons[start:end], rows.reasons[:n])
-        if maps.sigma_px.size > 0:
-            square_into(sigma_gray[start:end], variance)
-        _locate_tile(
-            rows,
-            cosine,
-            sine,
-            start,
-            mean_row,
-            variance,
-            coarse_px,
-            start,
-            n,
-            orders,
-            scales,
-            limits,
-            maps,
+        mean, variance = rows.single[10, :n], rows.single[11, :n]
+        for k in range(planes.cosine.shape[0]):
+            _to_gray(planes.cosine[k, start:end], step_gray, rows.cosine[k, :n])
+            _to_gray(planes.sine[k, start:end], step_gray, rows.sine[k, :n])
+        _mean_of(
+            planes.light[start:end], planes.exposure_index[start:end], planes.exposure_ms, mean
         )
+        widen(planes.reasons[start:end], rows.reasons[:n])
+        if maps.sigma_px.size > 0:
+            square_into(planes.sigma_gray[start:end], variance)
+        _locate_tile(rows, mean, variance, coarse_px, start, n, orders, scales, limits, maps)
         start = TILE * take_next(counter)
 
 
 @kernel
 def locate_phasors(
-    work: Any,
-    cosine: Any,
-    sine: Any,
-    mean: Any,
-    sigma_gray: Any,
-    known_reasons: Any,
-    coarse_px: Any,
-    orders: Any,
-    scales: Any,
-    limits: Any,
-    maps: Any,
+    work: Any, planes: Any, coarse_px: Any, orders: Any, scales: Any, limits: Any, maps: Any
 ) -> None:
     """Turn phasors into maps, see `absolute_phase.absolute_phase`."""
     for _ in numba.prange(work.n_threads):
-        _locate_share(
-            work.counter,
-            cosine,
-            sine,
-            mean,
-            sigma_gray,
-            known_reasons,
-            coarse_px,
-            orders,
-            scales,
-            limits,
-            maps,
-        )
+        _locate_share(work.counter, planes, coarse_px, orders, scales, limits, maps)

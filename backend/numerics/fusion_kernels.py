@@ -9,10 +9,9 @@ from backend.numerics.kernels import kernel, narrow_part, row_loop, take_next, w
 from backend.numerics.reasons import Reason
 from backend.numerics.sinusoid_rows import (
     NAN,
+    ONE,
     TILE,
     ZERO,
-    average,
-    count_saturated,
     demodulate,
     fill,
     new_rows,
@@ -33,12 +32,11 @@ BY_INDEX, BY_LENGTH, BY_VARIANCE = 0, 1, 2
 class Fused(NamedTuple):
     """Where fused phasors go."""
 
-    cosine: Any  # float32[k, p]
-    sine: Any  # float32[k, p]
-    mean: Any  # float32[k, p]
+    cosine: Any  # int16[k, p]
+    sine: Any  # int16[k, p]
+    light: Any  # float32[p]
     sigma_gray: Any  # float32[p]
     exposure_index: Any  # uint8[p]
-    saturated_samples: Any  # uint16[p]
     reasons: Any  # uint16[p]
 
 
@@ -50,6 +48,7 @@ class Exposures(NamedTuple):
     variance_gray2: Any  # float32[e]
     per_gray: Any  # float32[e]
     black_gray: float
+    steps_per_gray: float
 
 
 @row_loop
@@ -114,9 +113,29 @@ def _scales_of(total: Any, best_ms: Any, scale: Any) -> None:
 
 
 @row_loop
-def _rescale(scale: Any, offset: Any, row: Any) -> None:
+def _scales_of_one(total: Any, scale: Any) -> None:
+    for i in range(total.size):
+        scale[i] = ONE if total[i] > ZERO else ZERO
+
+
+_MOST = np.float32(32767)
+
+
+@row_loop
+def _store_steps(row: Any, scale: Any, per_gray: Any, steps: Any) -> None:
+    """Round gray levels to whole steps; what is beyond the range stays at its end."""
     for i in range(row.size):
-        row[i] = row[i] * scale[i] + offset
+        value = np.rint(row[i] * scale[i] * per_gray)
+        value = value if value < _MOST else _MOST
+        value = value if value > -_MOST else -_MOST
+        steps[i] = np.int16(np.int32(value))
+
+
+@row_loop
+def _store_light(row: Any, offset: Any, scale: Any, best_ms: Any, light: Any) -> None:
+    for i in range(row.size):
+        value = (row[i] - offset) * scale[i] / best_ms[i]
+        light[i] = value if value > ZERO else ZERO  # also where no exposure serves
 
 
 @row_loop
@@ -138,6 +157,35 @@ def _store_fused(
 
 
 @row_loop
+def _add_exposure(rows: Any, mean: Any, black: Any, weight: Any, sums: Any, light: Any) -> None:
+    """Add one exposure's phasors and light by their weight."""
+    n = weight.size
+    for k in range(rows.cosine.shape[0]):
+        _add_weighted(rows.cosine[k, :n], ZERO, weight, sums.cosine[k, :n])
+        _add_weighted(rows.sine[k, :n], ZERO, weight, sums.sine[k, :n])
+    _add_weighted(mean, black, weight, light)
+
+
+@row_loop
+def _store_phasors(
+    rows: Any,
+    light: Any,
+    black: Any,
+    scale: Any,
+    best_ms: Any,
+    per_gray: Any,
+    start: Any,
+    fused: Any,
+) -> None:
+    end = start + scale.size
+    for k in range(rows.cosine.shape[0]):
+        cosine, sine = rows.cosine[k, : scale.size], rows.sine[k, : scale.size]
+        _store_steps(cosine, scale, per_gray, fused.cosine[k, start:end])
+        _store_steps(sine, scale, per_gray, fused.sine[k, start:end])
+    _store_light(light, black, scale, best_ms, fused.light[start:end])
+
+
+@row_loop
 def _fuse_share(
     counter: Any,
     addresses: Any,
@@ -152,31 +200,34 @@ def _fuse_share(
 ) -> None:
     n_frequencies = steps.first_frame.size - 1
     n_frames = steps.first_frame[n_frequencies]
-    rows = new_rows(n_frequencies)
+    rows, sums = new_rows(n_frequencies), new_rows(n_frequencies)
     peaks = np.empty(TILE, np.uint16)
     index_row, usable_row = np.empty(TILE, np.int32), np.empty(TILE, np.int32)
     single = rows.single
+    black, per_gray = np.float32(exposures.black_gray), np.float32(exposures.steps_per_gray)
+    several = exposures.order.size > 1
     start = TILE * take_next(counter)
     while start < n_px:
         n = min(TILE, n_px - start)
         end = start + n
         weight, total, best, best_ms = single[0, :n], single[1, :n], single[2, :n], single[3, :n]
-        mean, variance, scale = single[4, :n], single[5, :n], single[6, :n]
+        light, variance, scale = single[4, :n], single[5, :n], single[6, :n]
         index, usable, reasons, peak = index_row[:n], usable_row[:n], rows.reasons[:n], peaks[:n]
+        means = rows.mean[:1]  # one for all frequencies; the weights make it their average
+        mean = means[0, :n]
         fill(total, ZERO)
         fill(best, ZERO)
-        fill(best_ms, ZERO)
+        fill(best_ms, ONE)
         fill(index, NO_EXPOSURE)
         fill(reasons, VALID)
-        fill(fused.saturated_samples[start:end], 0)
-        for k in range(n_frequencies):
-            fill(fused.cosine[k, start:end], ZERO)
-            fill(fused.sine[k, start:end], ZERO)
-            fill(fused.mean[k, start:end], ZERO)
+        if several:
+            fill(light, ZERO)
+            for k in range(n_frequencies):
+                fill(sums.cosine[k, :n], ZERO)
+                fill(sums.sine[k, :n], ZERO)
         for place in range(exposures.order.size):
             exposure = exposures.order[place]
             first = exposure * n_frames
-            black = np.float32(exposures.black_gray)
             demodulate(
                 addresses[first : first + n_frames],
                 wide,
@@ -185,20 +236,9 @@ def _fuse_share(
                 steps,
                 rows.cosine,
                 rows.sine,
-                rows.mean,
+                means,
                 peak,
             )
-            for frame in range(first, first + n_frames):
-                count = fused.saturated_samples[start:end]
-                if wide:
-                    count_saturated(
-                        wide_part(addresses[frame], start, n), np.float32(saturation), count
-                    )
-                else:
-                    count_saturated(
-                        narrow_part(addresses[frame], start, n), np.float32(saturation), count
-                    )
-            average(rows.mean, 0, mean)
             predict_variance(
                 mean,
                 exposures.variance_gray2[exposure],
@@ -224,15 +264,14 @@ def _fuse_share(
                 best_ms,
                 index,
             )
-            for k in range(n_frequencies):
-                _add_weighted(rows.cosine[k, :n], ZERO, weight, fused.cosine[k, start:end])
-                _add_weighted(rows.sine[k, :n], ZERO, weight, fused.sine[k, start:end])
-                _add_weighted(rows.mean[k, :n], black, weight, fused.mean[k, start:end])
-        _scales_of(total, best_ms, scale)
-        for k in range(n_frequencies):
-            _rescale(scale, ZERO, fused.cosine[k, start:end])
-            _rescale(scale, ZERO, fused.sine[k, start:end])
-            _rescale(scale, np.float32(exposures.black_gray), fused.mean[k, start:end])
+            if several:
+                _add_exposure(rows, mean, black, weight, sums, light)
+        if several:
+            _scales_of(total, best_ms, scale)
+            _store_phasors(sums, light, ZERO, scale, best_ms, per_gray, start, fused)
+        else:
+            _scales_of_one(total, scale)
+            _store_phasors(rows, mean, black, scale, best_ms, per_gray, start, fused)
         missing = _DARK if mode == BY_INDEX else _SATURATED
         _store_fused(
             total,

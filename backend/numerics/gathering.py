@@ -32,12 +32,13 @@ def gather(
     *,
     normal_limit: float,
 ) -> PointList:
-    """Collect the valid points of an organised cloud with what belongs to them.
+    """Collect the valid points of an organised cloud with what belongs to them; uses up the cloud's noise.
 
     Parameters
     ----------
     cloud
-        One depth per pixel in [mm], NaN where there is none, its noise and the pixels' rays.
+        One depth per pixel in [mm], NaN where there is none, its noise and the pixels' rays. The list of noise
+        takes the place of the map.
     exposure_index, brightness
         Maps of the same size; brightness may be missing.
     normal_limit
@@ -61,7 +62,7 @@ def gather(
     out = PointList(
         np.empty((n, 3), np.float32),
         np.empty((n, 3), np.float32),
-        np.empty(n, np.float32),
+        cloud.sigma_mm.reshape(-1)[:n],
         np.empty(n, np.float32),
         np.empty(n, np.float32),
         np.empty(n, np.uint8),
@@ -69,7 +70,7 @@ def gather(
     )
     light = np.zeros((1, 1), np.float32) if brightness is None else brightness
     maps = Maps(
-        depth, kernel_input(cloud.sigma_mm), kernel_input(exposure_index), kernel_input(light)
+        depth, cloud.sigma_mm.reshape(-1), kernel_input(exposure_index), kernel_input(light)
     )
     nodes = normal_nodes(cloud.rays)
     _fill(maps, brightness is not None, nodes, float(normal_limit), starts, out)
@@ -80,7 +81,7 @@ class Maps(NamedTuple):
     """What is gathered."""
 
     depth: Any  # float32[h, w]
-    sigma: Any  # float32[h, w]
+    sigma: Any  # float32[h w]: becomes the list
     exposure: Any  # uint8[h, w]
     light: Any  # float32[h, w], or [1, 1] without
 
@@ -92,6 +93,15 @@ def _count(depth: Any, counts: Any) -> None:
         for i in range(depth.shape[1]):
             number += 0 if np.isnan(depth[row, i]) else 1
         counts[row] = number
+
+
+@row_loop
+def _move_up(depth: Any, values: Any) -> Any:
+    """Move the values of the points that there are to the beginning, in place."""
+    n = 0
+    for i in range(depth.size):
+        values[n] = values[i]
+        n += 1 if depth[i] == depth[i] else 0  # NaN doesn't equal itself
 
 
 @row_loop
@@ -142,7 +152,6 @@ def _fill_run(
     _fill_points(depth, rays[0, i:j], rays[1, i:j], out.points_mm[n:m])
     _fill_normals(normals[0, i:j], normals[1, i:j], normals[2, i:j], out.normals[n:m])
     _fill_place(i, row, out.pixel_x[n:m], out.pixel_y[n:m])
-    _copy(maps.sigma[row, i:j], out.sigma_mm[n:m])
     _copy(maps.exposure[row, i:j], out.exposure_index[n:m])
     if with_light:
         _copy(maps.light[row, i:j], out.brightness[n:m])
@@ -164,6 +173,7 @@ def _fill(maps: Any, with_light: Any, nodes: Any, limit: Any, starts: Any, out: 
                     _fill_run(maps, with_light, work.rays, found, np.int64(row), begin, end, n, out)
                     n += end - begin
                 begin = end + 1
+    _move_up(maps.depth.reshape(-1), maps.sigma)
 
 
 def warm_up_kernels() -> None:

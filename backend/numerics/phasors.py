@@ -5,7 +5,7 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Shaped, UInt8, UInt16
+from jaxtyping import Float, Float32, Int16, Shaped, UInt8, UInt16
 
 from backend.numerics import fusion_kernels as kernels
 from backend.numerics.errors import FrameError
@@ -19,7 +19,6 @@ __all__ = [
     "NO_EXPOSURE",
     "Fusion",
     "Phasors",
-    "data_modulation",
     "fuse_exposures",
     "modulation_gray",
     "sinusoid_misfit",
@@ -37,23 +36,51 @@ _MODES = {
 
 
 class Phasors(NamedTuple):
-    """What all frames say of every pixel, in gray levels of the pixel's dominating exposure."""
+    """What all frames say of every pixel, in gray levels of the pixel's dominating exposure.
 
-    in_phase_gray: Float32[np.ndarray, "k h w"]
-    """B cos(phi) of each frequency in [gray]; 0 where no exposure serves the pixel."""
-    quadrature_gray: Float32[np.ndarray, "k h w"]
-    """B sin(phi) of each frequency in [gray]."""
-    mean_gray: Float32[np.ndarray, "k h w"]
-    """A of each frequency in [gray], black level included."""
+    Phasors are whole numbers of steps of 1/32767 of the range: a hundredth of what rounding to whole gray levels
+    adds to them, in half the memory of floating-point numbers.
+    """
+
+    in_phase: Int16[np.ndarray, "k h w"]
+    """B cos(phi) of each frequency in steps of `step_gray`; 0 where no exposure serves the pixel."""
+    quadrature: Int16[np.ndarray, "k h w"]
+    """B sin(phi) of each frequency in steps of `step_gray`."""
+    light_gray_per_ms: Float32[np.ndarray, "h w"]
+    """Mean of all frequencies' frames above black, over the exposure; 0 where no exposure serves the pixel."""
     sigma_gray: Float32[np.ndarray, "h w"]
     """Noise of one gray level that would give this phasor's noise in [gray]; NaN where no exposure
     serves the pixel. The phase has sqrt(noise gain) sigma/B, with gain 2/N for N even steps."""
     exposure_index: UInt8[np.ndarray, "h w"]
     """Exposure of the largest weight; 255 where none serves the pixel."""
-    saturated_samples: UInt16[np.ndarray, "h w"]
-    """How many of the pixel's samples are saturated, over all exposures."""
     reasons: UInt16[np.ndarray, "h w"]
     """Why a pixel has no phasor, or no trustworthy one: bits of `Reason`."""
+    step_gray: float
+    exposures_ms: tuple[float, ...]
+
+    @property
+    def in_phase_gray(self) -> Float32[np.ndarray, "k h w"]:
+        """B cos(phi) of each frequency in [gray], made anew at each call."""
+        return gray_levels(self.in_phase, self.step_gray)
+
+    @property
+    def quadrature_gray(self) -> Float32[np.ndarray, "k h w"]:
+        """B sin(phi) of each frequency in [gray], made anew at each call."""
+        return gray_levels(self.quadrature, self.step_gray)
+
+
+def gray_levels(steps: Int16[np.ndarray, "*any"], step_gray: float) -> Float32[np.ndarray, "*any"]:
+    """Turn whole steps into gray levels."""
+    gray: Float32[np.ndarray, "*any"] = steps * np.float32(step_gray)
+    return gray
+
+
+def whole_steps(gray: Float[np.ndarray, "*any"], step_gray: float) -> Int16[np.ndarray, "*any"]:
+    """Round gray levels to whole steps."""
+    steps: Int16[np.ndarray, "*any"] = np.clip(np.rint(gray / step_gray), -32767, 32767).astype(
+        np.int16
+    )
+    return steps
 
 
 @lru_cache(maxsize=64)
@@ -66,6 +93,19 @@ def steps_of(code: SineCode) -> Steps:
         first_frame=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         weights=np.ascontiguousarray(weights.astype(np.float32)),
     )
+
+
+@lru_cache(maxsize=64)
+def averaging_steps_of(code: SineCode) -> Steps:
+    """Return `steps_of` with the means' weights scaled so that all frequencies' means add up to their average."""
+    steps = steps_of(code)
+    scale = np.array([[1.0], [1.0], [1 / len(code.periods)]], dtype=np.float32)
+    return steps._replace(weights=steps.weights * scale)
+
+
+def exposure_table(exposures_ms: Sequence[float]) -> Float32[np.ndarray, "256"]:
+    """Return the exposure of each possible index in [ms]; 1 where there is none."""
+    return np.array([*exposures_ms, *[1.0] * (256 - len(exposures_ms))], np.float32)
 
 
 def fuse_exposures(
@@ -106,8 +146,8 @@ def fuse_exposures(
     Returns
     -------
     Phasors
-        In float32, in gray levels of the dominating exposure, so that a limit on modulation means
-        contrast in a picture that was really taken.
+        In gray levels of the dominating exposure, so that a limit on modulation means contrast in a picture
+        that was really taken. Phasors longer than `saturation_gray` (frames that clip, by masks) end there.
 
     Raises
     ------
@@ -147,42 +187,59 @@ def fuse_exposures(
         )
     wanted = _wanted_exposures(strategy, exposure_index, shape, len(exposure))
     n_frequencies = len(code.periods)
-    if out is not None and out.in_phase_gray.shape != (n_frequencies, *shape):
+    if out is not None and out.in_phase.shape != (n_frequencies, *shape):
         raise FrameError(
-            f"maps of shape {out.in_phase_gray.shape} can't take {n_frequencies} frequencies of "
+            f"maps of shape {out.in_phase.shape} can't take {n_frequencies} frequencies of "
             f"{shape}: give maps of this size"
         )
-    phasors = out or Phasors(
-        in_phase_gray=np.empty((n_frequencies, *shape), np.float32),
-        quadrature_gray=np.empty((n_frequencies, *shape), np.float32),
-        mean_gray=np.empty((n_frequencies, *shape), np.float32),
-        sigma_gray=np.empty(shape, np.float32),
-        exposure_index=np.empty(shape, np.uint8),
-        saturated_samples=np.empty(shape, np.uint16),
-        reasons=np.empty(shape, np.uint16),
-    )
+    range_gray = saturation_gray if np.isfinite(saturation_gray) else 65535 if stack.wide else 255
+    step_gray, times_ms = float(range_gray) / 32767, tuple(float(t) for t in exposure_ms)
+    if out is not None:
+        phasors = out._replace(step_gray=step_gray, exposures_ms=times_ms)
+    else:
+        phasors = _empty(n_frequencies, shape, step_gray, times_ms)
     kernels.fuse_exposures(
         new_work(),
         stack.addresses,
         stack.wide,
         shape[0] * shape[1],
-        steps_of(code),
+        averaging_steps_of(code),
         kernels.Exposures(
             order=np.argsort(-exposure, kind="stable").astype(np.int64),
             exposure_ms=exposure,
             variance_gray2=np.array([n.dark_variance_gray2 for n in noises], np.float32),
             per_gray=np.array([n.gray_per_e for n in noises], np.float32),
             black_gray=float(noises[0].black_gray),
+            steps_per_gray=1.0 / phasors.step_gray,
         ),
         wanted,
         _MODES[strategy],
         float(saturation_gray),
         kernels.Fused(
-            *(plane.reshape(n_frequencies, -1) for plane in phasors[:3]),
-            *(plane.reshape(-1) for plane in phasors[3:]),
+            cosine=phasors.in_phase.reshape(n_frequencies, -1),
+            sine=phasors.quadrature.reshape(n_frequencies, -1),
+            light=phasors.light_gray_per_ms.reshape(-1),
+            sigma_gray=phasors.sigma_gray.reshape(-1),
+            exposure_index=phasors.exposure_index.reshape(-1),
+            reasons=phasors.reasons.reshape(-1),
         ),
     )
     return phasors
+
+
+def _empty(
+    n_frequencies: int, shape: tuple[int, int], step_gray: float, exposures_ms: tuple[float, ...]
+) -> Phasors:
+    return Phasors(
+        in_phase=np.empty((n_frequencies, *shape), np.int16),
+        quadrature=np.empty((n_frequencies, *shape), np.int16),
+        light_gray_per_ms=np.empty(shape, np.float32),
+        sigma_gray=np.empty(shape, np.float32),
+        exposure_index=np.empty(shape, np.uint8),
+        reasons=np.empty(shape, np.uint16),
+        step_gray=step_gray,
+        exposures_ms=exposures_ms,
+    )
 
 
 def _collect(
@@ -233,16 +290,6 @@ def modulation_gray(phasors: Phasors) -> Float32[np.ndarray, "k h w"]:
         phasors.in_phase_gray, phasors.quadrature_gray
     )
     return modulation
-
-
-def data_modulation(phasors: Phasors, *, black_gray: float = 0.0) -> Float32[np.ndarray, "k h w"]:
-    """Contrast B/(A - black) of each frequency's fringes; NaN where there is no light."""
-    light = phasors.mean_gray - np.float32(black_gray)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        contrast: Float32[np.ndarray, "k h w"] = np.where(
-            light > 0, modulation_gray(phasors) / light, np.float32(np.nan)
-        )
-    return contrast
 
 
 def wrapped_phase_rad(phasors: Phasors) -> Float32[np.ndarray, "k h w"]:

@@ -5,23 +5,13 @@ from itertools import combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer, Shaped
+from jaxtyping import Bool, Float, Integer
 from scipy.special import ndtr
 
 from backend.numerics.errors import PlanningError
-from backend.numerics.histogram import DarkLevel
+from backend.numerics.uncertainty import NoiseModel
 
 FusionKind = Literal["weighted", "longest"]
-
-
-class CameraNoise(NamedTuple):
-    """Noise of a camera: sigma^2 = read^2 + (I - black) full_scale / full_well + 1/12, in [gray^2]."""
-
-    full_scale_gray: float
-    black_gray: float
-    read_noise_gray: float
-    full_well_e: float
-    """Electrons at full scale; inf means no shot noise."""
 
 
 class FringeCoding(NamedTuple):
@@ -42,6 +32,8 @@ class FringeCoding(NamedTuple):
 class ServiceLimits(NamedTuple):
     """When an exposure serves a pixel."""
 
+    full_scale_gray: float = 255.0
+    """The camera's largest gray level."""
     headroom_gray: float = 2.0
     """A pixel is saturated above full scale minus this."""
     modulation_min_gray: float = 3.0
@@ -53,7 +45,7 @@ class ServiceLimits(NamedTuple):
     one more pixel counts ten times as much as making another one precise."""
 
 
-class ExposureGrid(NamedTuple):
+class ExposureRange(NamedTuple):
     """Which exposure times are possible."""
 
     min_ms: float
@@ -168,7 +160,7 @@ def exposure_for_peak(
 def paper_exposures(
     t_pre_ms: float,
     peaks_gray: Float[np.ndarray, "zone"],
-    grid: ExposureGrid,
+    grid: ExposureRange,
     *,
     optimum_gray: float = 254.0,
     black_gray: float = 0.0,
@@ -188,7 +180,7 @@ def paper_exposures(
 
 
 def on_grid(
-    exposures_ms: Float[np.ndarray, "exposure"], grid: ExposureGrid
+    exposures_ms: Float[np.ndarray, "exposure"], grid: ExposureRange
 ) -> Float[np.ndarray, "exposure"]:
     """Round exposures down to the grid, within its ends."""
     low, high = _grid_ends(grid)
@@ -197,7 +189,7 @@ def on_grid(
     return np.asarray(np.clip(exposures_ms, low, high))
 
 
-def _grid_ends(grid: ExposureGrid) -> tuple[float, float]:
+def _grid_ends(grid: ExposureRange) -> tuple[float, float]:
     low, high = grid.min_ms, grid.max_ms
     if grid.period_ms:
         low = max(1.0, np.ceil(grid.min_ms / grid.period_ms * (1 - 1e-9))) * grid.period_ms
@@ -211,57 +203,6 @@ def _grid_ends(grid: ExposureGrid) -> tuple[float, float]:
 
 
 # ---------------------------------------------------------------- light per pixel
-
-
-def light_rate(
-    pictures_gray: Sequence[Shaped[np.ndarray, "h w"]],
-    exposures_ms: Sequence[float],
-    dark: DarkLevel,
-    *,
-    full_scale_gray: float,
-) -> Float[np.ndarray, "h w"]:
-    """Measure every pixel's light from its longest unsaturated white-field picture.
-
-    Parameters
-    ----------
-    pictures_gray
-        Pictures of the white field by one camera, in [gray], in any order.
-    exposures_ms
-        Their exposures in [ms].
-    dark
-        The camera's dark level.
-    full_scale_gray
-        Largest gray level; full scale - 1 counts as saturated.
-
-    Returns
-    -------
-    C in [gray/ms], float32, dark level subtracted. NaN where the pixel is background
-    in every picture. A pixel saturated at the shortest exposure gets what saturates it there:
-    a lower bound.
-
-    Raises
-    ------
-    PlanningError
-        If there is no picture, or not one exposure per picture.
-    """
-    if not pictures_gray or len(pictures_gray) != len(exposures_ms):
-        raise PlanningError(
-            f"{len(pictures_gray)} pictures came with {len(exposures_ms)} exposures; give one each"
-        )
-    order = np.argsort(exposures_ms)
-    rate = np.full(pictures_gray[0].shape, np.nan, np.float32)
-    for rank, index in enumerate(order):
-        picture = pictures_gray[index]
-        usable = picture > dark.limit_gray
-        if rank > 0:
-            usable &= picture < full_scale_gray - 1
-        np.copyto(
-            rate,
-            (picture.astype(np.float32) - np.float32(dark.level_gray))
-            / np.float32(exposures_ms[index]),
-            where=usable,
-        )
-    return rate
 
 
 def rate_histogram(
@@ -301,7 +242,7 @@ def rate_histogram(
 def phase_information(
     rates_gray_per_ms: Float[np.ndarray, "bin"],
     exposures_ms: Float[np.ndarray, "exposure"],
-    noise: CameraNoise,
+    noise: NoiseModel,
     coding: FringeCoding = _CODING,
     limits: ServiceLimits = _LIMITS,
 ) -> Float[np.ndarray, "exposure bin"]:
@@ -324,9 +265,9 @@ def phase_information(
     Notes
     -----
     .. math:: J = N B^2 / (2 \sigma_I^2), \quad
-        \sigma_I^2 = \sigma_{read}^2 + (A - black)\, I_{max} / n_{well} + 1/12
+        \sigma_I^2 = \sigma_{read}^2 + (A - black)\, G + 1/12
 
-    with B half of, and A - black the mean of, the fringe's low and high light C t. The noise is
+    with G gray levels per electron, B half of, and A - black the mean of, the fringe's low and high light C t. The noise is
     that of the mean level, which for N >= 4 equal steps is exact [1]_.
 
     References
@@ -337,11 +278,9 @@ def phase_information(
     signal = exposures_ms[:, None] * rates_gray_per_ms[None, :]
     modulation = signal * (coding.high_share - coding.low_share) / 2
     mean = signal * (coding.high_share + coding.low_share) / 2
-    variance = (
-        noise.read_noise_gray**2 + mean * noise.full_scale_gray / noise.full_well_e + 1.0 / 12.0
-    )
+    variance = noise.dark_variance_gray2 + mean * noise.gray_per_e
     brightest = noise.black_gray + signal * coding.high_share
-    served = (brightest <= noise.full_scale_gray - limits.headroom_gray) & (
+    served = (brightest <= limits.full_scale_gray - limits.headroom_gray) & (
         modulation >= limits.modulation_min_gray
     )
     return np.where(served, coding.steps * modulation**2 / (2 * variance), 0.0)
@@ -350,7 +289,7 @@ def phase_information(
 def predict(
     light: RateHistogram,
     exposures_ms: Float[np.ndarray, "exposure"],
-    noise: CameraNoise,
+    noise: NoiseModel,
     *,
     coding: FringeCoding = _CODING,
     limits: ServiceLimits = _LIMITS,
@@ -389,7 +328,7 @@ def predict(
     total = max(light.pixels.sum(), 1.0)
     too_bright = (
         noise.black_gray + times[0] * light.rates_gray_per_ms * coding.high_share
-        > noise.full_scale_gray - limits.headroom_gray
+        > limits.full_scale_gray - limits.headroom_gray
     )
     longest_first = np.argmax(information[::-1] > 0, axis=0)
     return Prediction(
@@ -462,8 +401,8 @@ class _Problem(NamedTuple):
 
 def plan_exposures(
     light: RateHistogram,
-    noise: CameraNoise,
-    grid: ExposureGrid,
+    noise: NoiseModel,
+    grid: ExposureRange,
     *,
     budget_s: float,
     count_range: tuple[int, int] = (1, 5),
@@ -543,8 +482,8 @@ def plan_exposures(
 
 def _problem(
     light: RateHistogram,
-    noise: CameraNoise,
-    grid: ExposureGrid,
+    noise: NoiseModel,
+    grid: ExposureRange,
     budget_s: float,
     coding: FringeCoding,
     limits: ServiceLimits,
@@ -563,8 +502,8 @@ def _problem(
 
 def _candidates(
     light: RateHistogram,
-    noise: CameraNoise,
-    grid: ExposureGrid,
+    noise: NoiseModel,
+    grid: ExposureRange,
     budget_ms: float,
     coding: FringeCoding,
     limits: ServiceLimits,
@@ -573,7 +512,7 @@ def _candidates(
 ) -> Float[np.ndarray, "candidate"]:
     """Return possible exposures, log-spaced from the brightest pixel's limit to the darkest's."""
     low, high = _grid_ends(grid)
-    usable = noise.full_scale_gray - limits.headroom_gray - noise.black_gray
+    usable = limits.full_scale_gray - limits.headroom_gray - noise.black_gray
     lit = light.rates_gray_per_ms[light.pixels > 0]
     # 0.999: just below the edge of a bin's centre, not at the mercy of rounding
     bright = 0.999 * usable / (coding.high_share * lit.max())
@@ -767,8 +706,8 @@ def _best_filling(
 
 def single_exposures(
     light: RateHistogram,
-    noise: CameraNoise,
-    grid: ExposureGrid,
+    noise: NoiseModel,
+    grid: ExposureRange,
     *,
     coding: FringeCoding = _CODING,
     limits: ServiceLimits = _LIMITS,
@@ -779,7 +718,7 @@ def single_exposures(
     The low one leaves at most `share` of the pixels saturated (the bright part is measured, the dark
     one lost); the high one uses the full range for the darkest tenth of the pixels.
     """
-    usable = noise.full_scale_gray - limits.headroom_gray - noise.black_gray
+    usable = limits.full_scale_gray - limits.headroom_gray - noise.black_gray
     cumulative = np.cumsum(light.pixels) / max(light.pixels.sum(), 1.0)
     bright = light.rates_gray_per_ms[np.searchsorted(cumulative, 1 - share, side="left")]
     dark = light.rates_gray_per_ms[np.searchsorted(cumulative, 0.1, side="left")]

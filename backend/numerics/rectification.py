@@ -1,5 +1,6 @@
 """Two cameras turned onto a common plane, so that partners lie in one row, without losing a pixel."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -91,8 +92,35 @@ def rectify(
 
     .. math:: Z = f b / (x_{reference} - x_{other})
 
-    Nothing is resampled here: maps are kept as lattices.
+    Nothing is resampled here: maps are kept as lattices. The last few geometries are remembered; nobody may write
+    to their arrays.
     """
+    return _rectified(_Pair(reference, other, other_from_reference))
+
+
+class _Pair:
+    """Two cameras, equal to another pair of the same numbers."""
+
+    def __init__(
+        self, reference: Pinhole, other: Pinhole, other_from_reference: RigidTransform
+    ) -> None:
+        self.reference, self.other = reference, other
+        self.other_from_reference = other_from_reference
+        self._numbers = tuple(
+            value.astype(np.float64).tobytes() if isinstance(value, np.ndarray) else value
+            for value in (*reference, *other, *other_from_reference)
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Pair) and self._numbers == other._numbers
+
+    def __hash__(self) -> int:
+        return hash(self._numbers)
+
+
+@lru_cache(maxsize=8)
+def _rectified(pair: _Pair) -> Rectification:
+    reference, other, other_from_reference = pair.reference, pair.other, pair.other_from_reference
     check_pinhole(reference, "the reference camera")
     check_pinhole(other, "the other camera")
     check_transform(other_from_reference, "the other camera")

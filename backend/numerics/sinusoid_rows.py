@@ -56,11 +56,11 @@ class Rows(NamedTuple):
 
 @row_loop
 def new_rows(n_frequencies: Any) -> Any:
-    """Allocate one thread's rows."""
+    """Allocate one thread's rows; the sums begin finite, so that 0 times what is left there is 0."""
     shape = (n_frequencies, TILE)
     return Rows(
-        np.empty(shape, np.float32),
-        np.empty(shape, np.float32),
+        np.zeros(shape, np.float32),
+        np.zeros(shape, np.float32),
         np.empty(shape, np.float32),
         np.empty(shape, np.float32),
         np.empty((12, TILE), np.float32),
@@ -115,10 +115,12 @@ def _add_four(
     frame_3: Any,
     weights: Any,
     first: Any,
+    keep: Any,
     cosine: Any,
     sine: Any,
     mean: Any,
 ) -> None:
+    """Add four frames to sums, or start the sums with them if `keep` is 0: that saves clearing them."""
     c0, c1, c2, c3 = (
         weights[0, first],
         weights[0, first + 1],
@@ -140,47 +142,8 @@ def _add_four(
     for i in range(frame_0.size):
         g0, g1 = np.float32(frame_0[i]), np.float32(frame_1[i])
         g2, g3 = np.float32(frame_2[i]), np.float32(frame_3[i])
-        cosine[i] += c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
-        sine[i] += s0 * g0 + s1 * g1 + s2 * g2 + s3 * g3
-        mean[i] += m0 * g0 + m1 * g1 + m2 * g2 + m3 * g3
-
-
-@row_loop
-def _set_four(
-    frame_0: Any,
-    frame_1: Any,
-    frame_2: Any,
-    frame_3: Any,
-    weights: Any,
-    first: Any,
-    cosine: Any,
-    sine: Any,
-    mean: Any,
-) -> None:
-    """Start sums with four frames: half the memory traffic of clearing and adding."""
-    c0, c1, c2, c3 = (
-        weights[0, first],
-        weights[0, first + 1],
-        weights[0, first + 2],
-        weights[0, first + 3],
-    )
-    s0, s1, s2, s3 = (
-        weights[1, first],
-        weights[1, first + 1],
-        weights[1, first + 2],
-        weights[1, first + 3],
-    )
-    m0, m1, m2, m3 = (
-        weights[2, first],
-        weights[2, first + 1],
-        weights[2, first + 2],
-        weights[2, first + 3],
-    )
-    for i in range(frame_0.size):
-        g0, g1 = np.float32(frame_0[i]), np.float32(frame_1[i])
-        g2, g3 = np.float32(frame_2[i]), np.float32(frame_3[i])
-        cosine[i] = c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
-        sine[i] = s0 * g0 + s1 * g1 + s2 * g2 + s3 * g3
+        cosine[i] = keep * cosine[i] + c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
+        sine[i] = keep * sine[i] + s0 * g0 + s1 * g1 + s2 * g2 + s3 * g3
         mean[i] += m0 * g0 + m1 * g1 + m2 * g2 + m3 * g3
 
 
@@ -204,13 +167,6 @@ def _keep_peak_of_four(frame_0: Any, frame_1: Any, frame_2: Any, frame_3: Any, p
 
 
 @row_loop
-def count_saturated(frame: Any, saturation: Any, count: Any) -> None:
-    """Count the samples of at least this gray level."""
-    for i in range(frame.size):
-        count[i] += np.uint16(1) if np.float32(frame[i]) >= saturation else np.uint16(0)
-
-
-@row_loop
 def _add_four_frames(
     addresses: Any,
     started: Any,
@@ -226,21 +182,16 @@ def _add_four_frames(
 ) -> None:
     first, second = addresses[frame], addresses[frame + 1]
     third, fourth = addresses[frame + 2], addresses[frame + 3]
+    keep = ONE if started else ZERO
     if wide:
         p, q = wide_part(first, start, n), wide_part(second, start, n)
         r, s = wide_part(third, start, n), wide_part(fourth, start, n)
-        if started:
-            _add_four(p, q, r, s, weights, frame, cosine, sine, mean)
-        else:
-            _set_four(p, q, r, s, weights, frame, cosine, sine, mean)
+        _add_four(p, q, r, s, weights, frame, keep, cosine, sine, mean)
         _keep_peak_of_four(p, q, r, s, peak)
     else:
         a, b = narrow_part(first, start, n), narrow_part(second, start, n)
         c, d = narrow_part(third, start, n), narrow_part(fourth, start, n)
-        if started:
-            _add_four(a, b, c, d, weights, frame, cosine, sine, mean)
-        else:
-            _set_four(a, b, c, d, weights, frame, cosine, sine, mean)
+        _add_four(a, b, c, d, weights, frame, keep, cosine, sine, mean)
         _keep_peak_of_four(a, b, c, d, peak)
 
 
@@ -297,14 +248,6 @@ def demodulate(
                 _add_frame(q, w_cosine, w_sine, w_mean, cosine_k, sine_k, mean_k)
                 _keep_peak(q, peak)
             frame += 1
-
-
-@row_loop
-def average(rows: Any, first: Any, average: Any) -> None:
-    """Average rows; with a loop per row, as a loop over rows inside one over pixels isn't vectorised."""
-    fill(average, ZERO)
-    for k in range(rows.shape[0]):
-        add_scaled(rows[k, first : first + average.size], ONE / np.float32(rows.shape[0]), average)
 
 
 @row_loop

@@ -4,6 +4,7 @@ Times are the best of several rounds and stand beside the time of copying the sa
 that they can be compared between machines.
 """
 
+import ctypes
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -149,12 +150,20 @@ def _silent(done: float, text: str = "") -> None:
 def _peak_mb(work: Callable[[], object]) -> float | None:
     """Return the resident memory at its highest during a run, above what it was before, in [MB]."""
     try:
+        _give_back()
         _CLEAR_PEAK.write_text("5")
         before = _resident_mb("VmRSS")
         work()
         return _resident_mb("VmHWM") - before
     except OSError:
         return None
+
+
+def _give_back() -> None:
+    """Return freed memory to the system where the C library can: what is kept would hide a part of the peak."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def _resident_mb(key: str) -> float:
@@ -252,8 +261,13 @@ class _Scene:
             for name, pictures in self.pictures.items()
             for pattern, picture in zip(_patterns(), pictures, strict=True)
         )
-        phasors = fusion(fringe_frames(frames), None, None, self.facts, FusionParams(), _silent)
-        phase = fringe_phase(phasors, self.facts, FringePhaseParams(), _silent)
+        # Nobody holds the phasors once the phase is there, as in a scan, whose results are on disk by then.
+        phase = fringe_phase(
+            fusion(fringe_frames(frames), None, None, self.facts, FusionParams(), _silent),
+            self.facts,
+            FringePhaseParams(),
+            _silent,
+        )
         cloud: Cloud = stereo_cloud(phase, self.calibration, None, StereoCloudParams(), _silent)
         return cloud
 

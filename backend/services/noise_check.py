@@ -14,11 +14,12 @@ from backend.domain.errors import StageUnavailableError
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.jobs.loading import load_scan
 from backend.numerics.camera_model import project
+from backend.numerics.phasors import modulation_gray
 from backend.numerics.scoring import Truth
-from backend.numerics.uncertainty import NoiseModel
 from backend.services.context import Context
 from backend.services.reporting import rig_truth
 from backend.services.variants import given_result, present_result
+from backend.stages.camera_noise import noise_model
 from backend.stages.fringe_phase import AbsolutePhase
 from backend.stages.fusion import AxisPhasors, Phasors
 from backend.stages.rig_geometry import pinhole, projector_from_reference
@@ -109,16 +110,11 @@ def column_bound_px(
     with mean A and modulation B scaled from the exposure that dominates the pixel to exposure e.
     """
     camera = facts.cameras[axis.camera]
-    noise = NoiseModel.of_camera(
-        read_noise_e=camera.read_noise_e,
-        full_well_e=camera.full_well_e,
-        full_scale_gray=camera.full_scale_gray,
-        black_gray=camera.black_level_gray,
-    )
+    noise = noise_model(camera)
     times = np.array([*exposures_ms, *[np.nan] * (256 - len(exposures_ms))])
     own_ms = times[axis.exposure_index]
-    mean = (axis.mean_gray.mean(axis=0) - axis.black_gray) / own_ms
-    modulation = np.hypot(axis.in_phase_gray, axis.quadrature_gray).mean(axis=0) / own_ms
+    mean = axis.light_gray_per_ms
+    modulation = modulation_gray(axis.phasors).mean(axis=0) / own_ms
     weight = sum(len(s) / 2 * f**2 for s, f in zip(axis.shifts_rad, axis.periods, strict=True))
     information = np.zeros(own_ms.shape)
     for time_ms in exposures_ms:

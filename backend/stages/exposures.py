@@ -10,23 +10,24 @@ from backend.domain.checks import Check, at_least
 from backend.domain.errors import StageFailedError
 from backend.domain.hints import Curve, Table, Value
 from backend.domain.params import Params, setting
-from backend.domain.rig import CameraFacts, RigFacts
+from backend.domain.rig import RigFacts
 from backend.domain.stage import stage
 from backend.domain.states import Level, Review
 from backend.numerics.fringe_orders import maximum_likelihood
 from backend.numerics.planning import (
-    CameraNoise,
-    ExposureGrid,
+    ExposureRange,
     FringeCoding,
     FusionKind,
     Prediction,
     RateHistogram,
+    ServiceLimits,
     paper_exposures,
     plan_exposures,
     predict,
     rate_histogram,
     single_exposures,
 )
+from backend.stages.camera_noise import noise_model
 from backend.stages.fringe_design import Aid, Directions, FringeDesign
 from backend.stages.pre_exposure import Preview
 from backend.stages.zones import Zones
@@ -201,8 +202,10 @@ class _Planner:
         self.preview, self.params = preview, params
         period = facts.projector.frame_period_ms if params.snap else None
         cameras = facts.cameras.values()
-        self.noise = camera_noise(facts.cameras[facts.reference])
-        self.grid = ExposureGrid(
+        camera = facts.cameras[facts.reference]
+        self.noise = noise_model(camera)
+        self.limits = ServiceLimits(full_scale_gray=camera.full_scale_gray)
+        self.grid = ExposureRange(
             min_ms=max(c.exposure_min_ms for c in cameras),
             max_ms=min(c.exposure_max_ms for c in cameras),
             period_ms=period,
@@ -234,7 +237,9 @@ class _Planner:
             return np.unique(paper.exposures_ms), bool(paper.clipped.any())
         if self.params.strategy == "planned":
             return self._planned().exposures_ms, False
-        low, high = single_exposures(self.light, self.noise, self.grid, coding=self.coding)
+        low, high = single_exposures(
+            self.light, self.noise, self.grid, coding=self.coding, limits=self.limits
+        )
         return np.array([low if self.params.strategy == "single_low" else high]), False
 
     def predict(self, exposures_ms: Float[np.ndarray, "exposure"]) -> Prediction:
@@ -244,6 +249,7 @@ class _Planner:
             np.clip(exposures_ms, self.grid.min_ms, self.grid.max_ms),
             self.noise,
             coding=self.coding,
+            limits=self.limits,
             fusion=self.fusion,
         )
 
@@ -259,6 +265,7 @@ class _Planner:
             budget_s=self.budget_s,
             count_range=(self.params.least, self.params.most),
             coding=self.coding,
+            limits=self.limits,
             fusion=self.fusion,
             gain_min=WORTHWHILE_GAIN,
         ).chosen
@@ -274,13 +281,3 @@ def light_of(preview: Preview) -> RateHistogram:
         for name, rate in preview.rate_gray_per_ms.items()
     ]
     return rate_histogram(lit)
-
-
-def camera_noise(facts: CameraFacts) -> CameraNoise:
-    """Convert a camera's facts to gray levels."""
-    return CameraNoise(
-        full_scale_gray=facts.full_scale_gray,
-        black_gray=facts.black_level_gray,
-        read_noise_gray=facts.read_noise_e * facts.full_scale_gray / facts.full_well_e,
-        full_well_e=facts.full_well_e,
-    )

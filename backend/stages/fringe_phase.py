@@ -18,7 +18,6 @@ from backend.domain.states import Review
 from backend.numerics import absolute_phase as numerics
 from backend.numerics import fringe_orders
 from backend.numerics.fringe_orders import FringeOrders
-from backend.numerics.phasors import Phasors as FusedFrames
 from backend.stages.cloud import REASON_LABELS
 from backend.stages.fusion import AxisPhasors, Phasors, first_of_each_camera
 
@@ -102,7 +101,7 @@ def _enough(result: AbsolutePhase, params: FringePhaseParams) -> Check:
     )  # fmt: skip
 
 
-@stage(title="Phase", version=1, review=Review.ON_WARNING, checks=(_enough,))
+@stage(title="Phase", version=2, review=Review.ON_WARNING, checks=(_enough,))
 def fringe_phase(
     phasors: Phasors, facts: RigFacts, params: FringePhaseParams, progress: Progress
 ) -> AbsolutePhase:
@@ -148,26 +147,17 @@ def decode(
     axis: AxisPhasors, orders: FringeOrders, size_px: int, params: FringePhaseParams
 ) -> numerics.AbsolutePhase:
     """Decode one camera along one direction."""
-    fused = FusedFrames(
-        axis.in_phase_gray,
-        axis.quadrature_gray,
-        axis.mean_gray,
-        axis.sigma_gray,
-        axis.exposure_index,
-        np.zeros((0, 0), np.uint16),
-        axis.reasons,
-    )
     limits = numerics.Limits(
         params.modulation_min_gray, _residual_limit(orders, params), params.guard_band
     )
     return numerics.absolute_phase(
-        fused,
+        axis.phasors,
         axis.code,
         orders,
         size_px=size_px,
         limits=limits,
-        black_gray=axis.black_gray,
         coarse_px=None if axis.gray is None else axis.gray.position_px,
+        with_wrapped=True,
     )
 
 
@@ -190,11 +180,12 @@ def _summarise(
     first = first_of_each_camera(phasors.sets)
     sigma = {n: _sigma(d) for n, d in main.items()}
     valid = sum(int(np.count_nonzero(d.reasons == 0)) for d in main.values())
-    finite = np.concatenate([s[np.isfinite(s)][::7] for s in sigma.values()])
+    some = np.concatenate([s.ravel()[::7] for s in sigma.values()])
+    finite = some[np.isfinite(some)]
     return AbsolutePhase(
         projector_px={n: d.projector_px for n, d in decoded["x"].items()},
         projector_row_px={n: d.projector_px for n, d in decoded["y"].items()},
-        wrapped_rad={n: _wrapped(s) for n, s in first.items()},
+        wrapped_rad={n: _wrapped(d) for n, d in main.items()},
         modulation_gray={n: d.modulation_gray for n, d in main.items()},
         residual_cycles={n: d.residual_cycles for n, d in main.items()},
         sigma_px=sigma,
@@ -214,7 +205,6 @@ def _sigma(decoded: numerics.AbsolutePhase) -> Float32[np.ndarray, "h w"]:
     return decoded.sigma_px
 
 
-def _wrapped(axis: AxisPhasors) -> Float32[np.ndarray, "h w"]:
-    finest = int(np.argmax(axis.periods))
-    wrapped = np.arctan2(axis.quadrature_gray[finest], axis.in_phase_gray[finest])
-    return np.where(axis.reasons == 0, wrapped, np.float32(np.nan))
+def _wrapped(decoded: numerics.AbsolutePhase) -> Float32[np.ndarray, "h w"]:
+    assert decoded.wrapped_rad is not None, "decode asks for it"
+    return decoded.wrapped_rad

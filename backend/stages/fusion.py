@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Float32, Int16, UInt8, UInt16
 
 from backend.domain.checks import Check, at_most
 from backend.domain.errors import StageFailedError
@@ -20,7 +20,7 @@ from backend.numerics import phasors as numerics
 from backend.numerics.phasors import NO_EXPOSURE
 from backend.numerics.reasons import Reason
 from backend.numerics.sine_code import SineCode
-from backend.numerics.uncertainty import NoiseModel
+from backend.stages.camera_noise import noise_model
 from backend.stages.cloud import REASON_LABELS
 from backend.stages.fringe_capture import FringeFrames
 from backend.stages.fringe_sets import FringeSet, fringe_sets
@@ -55,15 +55,31 @@ class AxisPhasors:
     axis: Axis
     periods: tuple[float, ...]
     shifts_rad: tuple[tuple[float, ...], ...]
-    in_phase_gray: Float32[np.ndarray, "k h w"]
-    quadrature_gray: Float32[np.ndarray, "k h w"]
-    mean_gray: Float32[np.ndarray, "k h w"]
+    in_phase: Int16[np.ndarray, "k h w"]
+    quadrature: Int16[np.ndarray, "k h w"]
+    light_gray_per_ms: Float32[np.ndarray, "h w"]
     sigma_gray: Float32[np.ndarray, "h w"]
     exposure_index: UInt8[np.ndarray, "h w"]
     reasons: UInt16[np.ndarray, "h w"]
+    step_gray: float
+    exposures_ms: tuple[float, ...]
     black_gray: float
     gray: GrayPosition | None
     """Coarse position from a Gray code, if one was projected."""
+
+    @property
+    def phasors(self) -> numerics.Phasors:
+        """The maps as numerics takes them."""
+        return numerics.Phasors(
+            self.in_phase,
+            self.quadrature,
+            self.light_gray_per_ms,
+            self.sigma_gray,
+            self.exposure_index,
+            self.reasons,
+            step_gray=self.step_gray,
+            exposures_ms=self.exposures_ms,
+        )
 
     @property
     def code(self) -> SineCode:
@@ -100,7 +116,7 @@ def _not_saturated(result: Phasors, params: FusionParams) -> Check:
     )  # fmt: skip
 
 
-@stage(title="Fusion", version=1, review=Review.ON_WARNING, checks=(_not_saturated,))
+@stage(title="Fusion", version=2, review=Review.ON_WARNING, checks=(_not_saturated,))
 def fusion(
     frames: FringeFrames,
     preview: Preview | None,
@@ -127,7 +143,7 @@ def _fuse(
     facts: RigFacts,
     params: FusionParams,
 ) -> AxisPhasors:
-    noise = noise_model(fringes, facts)
+    noise = noise_model(facts.cameras[fringes.camera], gain_db=fringes.gain_db)
     code = SineCode(fringes.periods, fringes.shifts_rad)
     full_scale_gray = 2.0**fringes.bit_depth - 1
     saturation_gray = params.saturation_gray or full_scale_gray - 1
@@ -145,26 +161,9 @@ def _fuse(
         axis=fringes.axis,
         periods=fringes.periods,
         shifts_rad=fringes.shifts_rad,
-        in_phase_gray=result.in_phase_gray,
-        quadrature_gray=result.quadrature_gray,
-        mean_gray=result.mean_gray,
-        sigma_gray=result.sigma_gray,
-        exposure_index=result.exposure_index,
-        reasons=result.reasons,
+        **result._asdict(),
         black_gray=noise.black_gray,
         gray=gray_position(fringes, facts, result.exposure_index, noise),
-    )
-
-
-def noise_model(fringes: FringeSet, facts: RigFacts) -> NoiseModel:
-    """Translate the facts of the camera that took the fringes."""
-    camera = facts.cameras[fringes.camera]
-    return NoiseModel.of_camera(
-        read_noise_e=camera.read_noise_e,
-        full_well_e=camera.full_well_e,
-        full_scale_gray=camera.full_scale_gray,
-        black_gray=camera.black_level_gray,
-        gain_db=fringes.gain_db,
     )
 
 
@@ -203,16 +202,12 @@ def _summarise(sets: tuple[AxisPhasors, ...], exposures_ms: tuple[float, ...]) -
     pixels = sum(s.reasons.size for s in first.values())
     saturated = sum(int(np.count_nonzero(s.reasons & Reason.SATURATED)) for s in first.values())
     served = sum(int(np.count_nonzero(s.exposure_index != NO_EXPOSURE)) for s in first.values())
-    times = np.array([*exposures_ms, *[1.0] * (256 - len(exposures_ms))], np.float32)
     return Phasors(
         sets=sets,
         exposures_ms=exposures_ms,
         exposure_names=tuple(f"{t:.4g} ms" for t in exposures_ms),
         exposure_map={n: s.exposure_index + np.uint8(1) for n, s in first.items()},
-        fused={
-            n: np.maximum(s.mean_gray[0] - np.float32(s.black_gray), 0) / times[s.exposure_index]
-            for n, s in first.items()
-        },
+        fused={n: s.light_gray_per_ms for n, s in first.items()},
         reasons={n: s.reasons for n, s in first.items()},
         served_share=served / pixels,
         saturated_share=saturated / pixels,

@@ -10,7 +10,7 @@ from backend.numerics.fringe_orders import (
     maximum_likelihood,
     stage_noise_gain,
 )
-from backend.numerics.phasors import Phasors, fuse_exposures, wrapped_phase_rad
+from backend.numerics.phasors import Phasors, fuse_exposures, whole_steps, wrapped_phase_rad
 from backend.numerics.sine_code import SineCode
 from backend.numerics.uncertainty import (
     NoiseModel,
@@ -37,14 +37,16 @@ def noisy_phasors(x: np.ndarray, ratio: float, seed: int, code: SineCode = CODE)
     phase = 2 * np.pi * np.array(code.periods)[:, None, None] * x
     # Four even steps: both parts of the phasor have the variance sigma^2 / 2.
     noise = rng.standard_normal((2, *phase.shape)) * sigma / np.sqrt(2)
+    step_gray = 0.01
     return Phasors(
-        in_phase_gray=(modulation * np.cos(phase) + noise[0]).astype(np.float32),
-        quadrature_gray=(modulation * np.sin(phase) + noise[1]).astype(np.float32),
-        mean_gray=np.full(phase.shape, 120, np.float32),
+        in_phase=whole_steps(modulation * np.cos(phase) + noise[0], step_gray),
+        quadrature=whole_steps(modulation * np.sin(phase) + noise[1], step_gray),
+        light_gray_per_ms=np.full(x.shape, 120, np.float32),
         sigma_gray=np.full(x.shape, sigma, np.float32),
         exposure_index=np.zeros(x.shape, np.uint8),
-        saturated_samples=np.zeros(x.shape, np.uint16),
         reasons=np.zeros(x.shape, np.uint16),
+        step_gray=step_gray,
+        exposures_ms=(1.0,),
     )
 
 

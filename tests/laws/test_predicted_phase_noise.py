@@ -1,14 +1,15 @@
 import numpy as np
 import pytest
 
-from backend.numerics.planning import CameraNoise, FringeCoding, phase_information
+from backend.numerics.planning import FringeCoding, phase_information
+from backend.numerics.uncertainty import NoiseModel
 
 
 @pytest.mark.parametrize("rate", [0.2, 1.0, 4.0])
 @pytest.mark.parametrize("steps", [4, 5, 8])
 def test_predicted_noise_is_what_a_camera_shows(rate, steps):
     """Shot, read and rounding noise of simulated fringes against the formula, within 2 %."""
-    noise = CameraNoise(full_scale_gray=255, black_gray=6, read_noise_gray=0.3, full_well_e=15_300)
+    noise = NoiseModel(read_gray=0.3, gray_per_e=255 / 15_300, black_gray=6)
     coding, time_ms = FringeCoding(steps=steps), 50.0
     rng = np.random.default_rng(steps)
     truth = rng.uniform(-np.pi, np.pi, 60_000)

@@ -65,15 +65,13 @@ def test_both_ways_in_give_the_same_maps():
         frames, code, orders, size_px=SIZE_PX, saturation_gray=254, noise=noise, with_margin=True
     )
     phasors = fuse_exposures([frames], code, exposure_ms=[5.0], noise=noise, saturation_gray=254)
-    through = absolute_phase(
-        phasors, code, orders, size_px=SIZE_PX, black_gray=2.0, with_margin=True
-    )
+    through = absolute_phase(phasors, code, orders, size_px=SIZE_PX, with_margin=True)
     assert (direct.reasons == through.reasons).all()
     assert np.nanmax(np.abs(direct.projector_px - through.projector_px)) < 1e-3
-    for a, b in zip(direct, through, strict=True):
+    for a, b in zip(direct[:6], through[:6], strict=True):
         assert a is not None
         assert b is not None
-        assert np.allclose(a, b, rtol=1e-3, atol=1e-4, equal_nan=True)
+        assert np.allclose(a, b, rtol=1e-3, atol=5e-4, equal_nan=True)
 
 
 def test_the_fast_path_for_three_frequencies_agrees_with_the_general_one():
@@ -191,13 +189,14 @@ def hierarchical_like(periods):
     return cascade(periods)
 
 
-def test_phasors_with_nan_are_invalid_and_nothing_crashes():
+def test_phasors_without_length_are_invalid_and_nothing_crashes():
     code = SineCode.equal_steps((59, 64, 70), 4)
     phasors = fuse_exposures(
         [Scene(X).frames(code)], code, exposure_ms=[1.0], noise=NOISE, saturation_gray=254
     )
-    phasors.in_phase_gray[:, 0] = np.nan
-    phasors.quadrature_gray[1, 1] = np.nan
+    phasors.in_phase[:, 0] = phasors.quadrature[:, 0] = 0
+    phasors.in_phase[1, 1] = phasors.quadrature[1, 1] = 0
+    phasors.light_gray_per_ms[1, 5:9] = np.nan
     decoded = absolute_phase(phasors, code, maximum_likelihood(code.periods), size_px=SIZE_PX)
     assert (decoded.reasons[:2] != 0).all()
     assert np.isnan(decoded.projector_px[:2]).all()
