@@ -102,6 +102,16 @@ class NewScanPanel:
         presets = list(method.presets) if method else []
         _set_options(self._preset, [_NO_PRESET, *presets])
         self._preset.visible = bool(presets)
+        if method is not None:
+            self._choose_rig(method.name)
+
+    def _choose_rig(self, method: str) -> None:
+        """Leave a rig that isn't made for the method for one that is."""
+        fits = [title for title, rig in self._rigs.items() if _suits(rig, method)]
+        if fits and self._rig.value not in fits:
+            menu: Any = self._rig
+            menu.value = fits[0]
+            self._show_rig()
 
     def _show_rig(self) -> None:
         rig = self._rigs.get(self._rig.value)
@@ -186,6 +196,12 @@ def _as_list(value: Any) -> Any:
 
 def _unique(title: str, name: str, titles: list[str]) -> str:
     return title if titles.count(title) == 1 else f"{title} ({name})"
+
+
+def _suits(rig: RigOffer, method: str) -> bool:
+    """Tell whether a rig says that it is made for a method, or says nothing."""
+    made_for, not_for = (rig.options_schema.get(k, ()) for k in ("methods", "not_for_methods"))
+    return (not made_for or method in made_for) and method not in not_for
 
 
 def _set_options(menu: Any, options: list[str]) -> None:

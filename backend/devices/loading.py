@@ -84,8 +84,8 @@ def options_schema(name: str) -> dict[str, Any]:
     """Return the JSON schema of a rig's options, empty where its factory doesn't say.
 
     A factory says it by an attribute `options_model`: the pydantic model of the mapping that it takes. Beside the
-    properties the schema may hold `methods`, the methods that the rig is made for; its property `scene`
-    may have a `pattern` that tells whose scene a name is.
+    properties the schema may hold a `title`, `methods`, the methods that the rig is made for, and
+    `not_for_methods`; its property `scene` may have a `pattern` that tells whose scene a name is.
 
     Raises
     ------

@@ -32,9 +32,13 @@ def _kept(rig: KeptRig) -> RigOffer:
 def _offer(name: str, package: str) -> RigOffer:
     offer = RigOffer(name=name, title=_title(name), doc=package, options_schema={})
     try:
-        return offer.model_copy(update={"options_schema": loading.options_schema(name)})
+        schema = loading.options_schema(name)
     except UnglareError as error:
         return offer.model_copy(update={"error": error.sentence})
+    named = str(schema.get("title", ""))
+    # A title of one word is the options' class, which nobody named for operators.
+    title = named if " " in named else offer.title
+    return offer.model_copy(update={"options_schema": schema, "title": title})
 
 
 def _title(name: str) -> str:

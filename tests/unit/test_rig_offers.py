@@ -22,6 +22,12 @@ def test_the_simulated_rig_is_offered_with_its_options() -> None:
     assert {"scene", "size", "seed"} <= set(offer.options_schema["properties"])
 
 
+def test_a_rig_whose_options_have_a_title_is_offered_under_it() -> None:
+    titles = {offer.name: offer.title for offer in offer_rigs()}
+    assert titles["simulated"] == "Simulated"
+    assert titles["sim-lcd"] == "Simulated screen and mirror"
+
+
 def test_a_rig_that_cant_be_loaded_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = (loading.RigEntry("acme-rig", "acme 1.0"),)
     monkeypatch.setattr(loading, "available_rigs", lambda: entries)

@@ -1,12 +1,14 @@
 """Every setting of the simulated rig, in physical units."""
 
-from pydantic import Field, field_validator
+from pydantic import ConfigDict, Field, field_validator
 
 from backend.devices.sim.options import RigOptions, Size
 
 
 class SimulatedRigConfig(RigOptions):
     """What stands before the simulated rig, how the rig is built, and what goes wrong with it."""
+
+    model_config = ConfigDict(json_schema_extra={"not_for_methods": ["fringe-reflection"]})
 
     scene: str = Field(
         "high-contrast",
