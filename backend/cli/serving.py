@@ -22,6 +22,8 @@ _Port = Annotated[
 ]
 
 DEMO_SCENE = "high-contrast"
+DEMO_METHOD = "hdr-fringe"
+"""Unless the scene's rig is made for others."""
 
 
 def register(application: typer.Typer) -> None:
@@ -54,32 +56,31 @@ def demo(
     rig_options: RigOptions = None,
     data: DataFolder = None,
 ) -> None:
-    """Serve the application with the simulated rig, and begin a first scan."""
+    """Serve the application with the simulated rigs, and begin a first scan."""
     from backend import main
+    from backend.devices.loading import rig_for
     from backend.settings import load_settings
 
     options = parse_rig_options(rig_options, scene=scene)
-    settings = load_settings(
-        host=host, port=port, data_folder=data, rig="simulated", rig_options=options
-    )
-    main.serve(settings, prepare=lambda services: begin_first_scan(services, options))
+    rig = rig_for(options["scene"], DEMO_METHOD)
+    settings = load_settings(host=host, port=port, data_folder=data, rig=rig, rig_options=options)
+    main.serve(settings, prepare=lambda services: begin_first_scan(services, options, rig))
 
 
-def begin_first_scan(services: "Services", options: dict[str, Any]) -> None:
+def begin_first_scan(services: "Services", options: dict[str, Any], rig: str = "simulated") -> None:
     """Make and start a scan where there is none yet; an old data folder is left as it is."""
     import logging
 
     from backend.contract.requests import CreateScan, StartRun
+    from backend.devices.loading import options_schema
     from backend.domain.errors import UnglareError
 
     if services.scans(limit=1):
         return
     try:
+        method = options_schema(rig).get("methods", [DEMO_METHOD])[0]
         state = services.create_scan(
-            CreateScan(
-                method="hdr-fringe", rig="simulated", rig_options=options, name="First scan"
-            ),
-            "demo",
+            CreateScan(method=method, rig=rig, rig_options=options, name="First scan"), "demo"
         )
         services.run(state.id, StartRun(), "demo")
     except UnglareError as error:
