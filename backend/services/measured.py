@@ -36,7 +36,9 @@ class Measured:
     widening_px: Mapping[str, float] | None = None
     """By how much white stripes are wider than black ones, median per part, in projector pixels."""
     light_s: float | None = None
-    """Exposure time of one camera's frames."""
+    """Exposure time of the fringes or the code."""
+    all_light_s: float | None = None
+    """Of every picture, what was captured before included."""
     panels: tuple[Panel, ...] = ()
 
     @property

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
 
 from backend.domain.checks import Check
 from backend.domain.errors import StageFailedError
@@ -82,8 +82,6 @@ class BandFrames:
     """Per camera, where the first band begins, see `numerics.epipolar_bands`."""
     width_px: Mapping[str, float]
     bits: int
-    exposure_index: tuple[int, ...]
-    """Which of the first fringes' exposures those of the bands are, shortest first; 255: none of them."""
     exposures_ms: tuple[float, ...]
     frame_count: Annotated[int, Value("Frames")]
     exposure_time_s: Annotated[float, Value("Exposure time in all", unit="s")]
@@ -126,18 +124,13 @@ def band_capture(
         raise StageFailedError(
             "Every pixel with a phase has a point: there is nothing that bands could clear up."
         )
-    others = [n for n in phase.projector_px if n != calibration.reference]
-    names = [calibration.reference, *(others if params.cameras == "all" else [])]
-    bands = {name: _bands(name, phase, doubtful, calibration, params.bits) for name in names}
-    factor = np.ones((1, 1), np.float32) if mask is None else mask.factor.astype(np.float32)
-    masks = _Masks(factor, {name: lines(calibration, name) for name in names}, bands)
+    masks, dimmed = _masks(phase, doubtful, mask, calibration, params)
     patterns = exposures.design.patterns(facts.projector)
-    frames = 2 * params.bits * len(names) * len(patterns)
+    frames = 2 * params.bits * len(masks.bands) * len(patterns)
     times_ms = tuple(sorted(params.exposures_ms or ())) or (
-        _exposure_ms(phase, exposures, doubtful, facts, params, frames=frames),
+        _exposure_ms(phase, exposures, doubtful, facts, params, frames=frames, dimmed=dimmed),
     )
-    numbers = tuple(_number(t, exposures.exposures_ms) for t in times_ms)
-    return shoot(capture_plan(patterns, times_ms, masks, numbers, params, share))
+    return shoot(capture_plan(patterns, times_ms, masks, params, share))
 
 
 def doubtful_pixels(phase: AbsolutePhase, cloud: Cloud) -> Bool[np.ndarray, "h w"]:
@@ -174,11 +167,29 @@ class _Masks:
         return InMemory(lit.astype(np.float32) * self.factor)
 
 
+def _masks(
+    phase: AbsolutePhase,
+    doubtful: Bool[np.ndarray, "h w"],
+    mask: IntensityMask | None,
+    calibration: RigCalibration,
+    params: BandCaptureParams,
+) -> tuple[_Masks, float]:
+    """Spread the bands of every camera over the lines that the doubtful pixels' light comes from."""
+    reference = calibration.reference
+    others = [n for n in phase.projector_px if n != reference and params.cameras == "all"]
+    all_lines = {name: lines(calibration, name) for name in (reference, *others)}
+    places = _places(phase, doubtful, all_lines[reference], reference)
+    numbers_px = {name: all_lines[name].projector_px[places] for name in others}
+    numbers_px[reference] = all_lines[reference].camera_px[doubtful]
+    bands = {name: bands_around(numbers_px[name], params.bits) for name in all_lines}
+    factor, dimmed = _brightened(mask, places)
+    return _Masks(factor, all_lines, bands), dimmed
+
+
 def capture_plan(
     patterns: tuple[Pattern, ...],
     exposures_ms: tuple[float, ...],
     masks: _Masks,
-    exposure_index: tuple[int, ...],
     params: BandCaptureParams,
     doubtful_share: float,
 ) -> Plan[BandFrames]:
@@ -204,7 +215,6 @@ def capture_plan(
         width_px={name: bands.width_px for name, bands in masks.bands.items()},
         bits=params.bits,
         exposures_ms=exposures_ms,
-        exposure_index=exposure_index,
         frame_count=len(frames),
         exposure_time_s=sum(f.exposure_ms or 0.0 for f in frames) / 1000.0,
         doubtful_share=doubtful_share,
@@ -218,18 +228,11 @@ def _no_bands(bits: int, doubtful_share: float) -> BandFrames:
         low_px={},
         width_px={},
         bits=bits,
-        exposure_index=(),
         exposures_ms=(),
         frame_count=0,
         exposure_time_s=0.0,
         doubtful_share=doubtful_share,
     )
-
-
-def _number(exposure_ms: float, exposures_ms: tuple[float, ...]) -> int:
-    """Return which exposure of the first fringes this is; 255 for none."""
-    same = [n for n, t in enumerate(exposures_ms) if abs(t - exposure_ms) < 1e-6 * exposure_ms]
-    return same[0] if same else _NO_EXPOSURE
 
 
 def _coordinate(phase: AbsolutePhase, camera: str) -> Float32[np.ndarray, "h w"]:
@@ -248,38 +251,44 @@ def _exposure_ms(
     params: BandCaptureParams,
     *,
     frames: int,
+    dimmed: float,
 ) -> float:
     """Return the exposure that serves most of the doubtful pixels, or what the budget leaves for each frame."""
     used = phase.exposure_index[facts.reference][doubtful]
     counts = np.bincount(used[used != _NO_EXPOSURE], minlength=len(exposures.exposures_ms))
     wanted_ms = exposures.exposures_ms[int(np.argmax(counts[: len(exposures.exposures_ms)]))]
     grid = ExposureGrid.of(facts, snap=params.snap)
-    return grid.ms(grid.index(min(wanted_ms, 1000.0 * params.budget_s / frames)))
+    return grid.ms(grid.index(min(dimmed * wanted_ms, 1000.0 * params.budget_s / frames)))
 
 
-def _bands(
-    name: str,
-    phase: AbsolutePhase,
-    doubtful: Bool[np.ndarray, "h w"],
-    calibration: RigCalibration,
-    bits: int,
-) -> Bands:
-    """Spread the bands over the lines that the doubtful pixels' light comes from."""
-    reference = calibration.reference
-    own = lines(calibration, reference)
-    if name == reference:
-        return bands_around(own.camera_px[doubtful], bits)
-    # The reference's lines, and the columns measured however wrongly, tell about where on the projector that is.
+class _Places(NamedTuple):
+    """Projector pixels, as an index into its pictures."""
+
+    row: Int64[np.ndarray, "n"]
+    column: Int64[np.ndarray, "n"]
+
+
+def _places(
+    phase: AbsolutePhase, doubtful: Bool[np.ndarray, "h w"], own: EpipolarLines, camera: str
+) -> _Places:
+    """Tell about where the doubtful pixels' light comes from: their lines, and the columns measured however wrongly."""
     some = np.flatnonzero(doubtful)[:: max(1, np.count_nonzero(doubtful) // _SAMPLE)]
-    numbers_px = own.camera_px.reshape(-1)[some]
-    columns_px = phase.projector_px[reference].reshape(-1)[some]
     height_px, width_px = own.projector_px.shape
-    columns = np.clip(np.rint(columns_px), 0, width_px - 1).astype(np.int64)
-    rows = np.array(
-        [
-            np.interp(number, own.projector_px[:, column], np.arange(height_px))
-            for number, column in zip(numbers_px, columns, strict=True)
-        ]
-    )
-    other = lines(calibration, name).projector_px
-    return bands_around(other[np.rint(rows).astype(np.int64), columns], bits)
+    columns = np.rint(phase.projector_px[camera].reshape(-1)[some])
+    columns = np.clip(columns, 0, width_px - 1).astype(np.int64)
+    numbers_px = own.camera_px.reshape(-1)[some]
+    rows = [
+        np.interp(number, own.projector_px[:, column], np.arange(height_px))
+        for number, column in zip(numbers_px, columns, strict=True)
+    ]
+    return _Places(np.rint(rows).astype(np.int64), columns)
+
+
+def _brightened(
+    mask: IntensityMask | None, places: _Places
+) -> tuple[Float32[np.ndarray, "_h _w"], float]:
+    """Return the mask as bright as the doubtful places allow, and by how much it dimmed them: time is short."""
+    if mask is None:
+        return np.ones((1, 1), np.float32), 1.0
+    dimmed = max(float(np.quantile(mask.factor[places], 0.9)), 1 / 255)
+    return np.minimum(mask.factor.astype(np.float32) / np.float32(dimmed), np.float32(1)), dimmed

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32
 
 from backend.domain.params import Params, setting
 from backend.domain.rig import RigCalibration, RigFacts
@@ -17,7 +17,8 @@ from backend.stages.fringe_capture import fringe_frames
 from backend.stages.fringe_phase import AbsolutePhase, FringePhaseParams, fringe_phase
 from backend.stages.fusion import FusionParams, fusion
 
-_NO_EXPOSURE = 255
+_OTHER_EXPOSURE = 255
+"""None of the first fringes' exposures."""
 
 
 class BandPhaseParams(Params):
@@ -72,8 +73,6 @@ class _Found:
     residual_cycles: Float32[np.ndarray, "h w"]
     modulation_gray: Float32[np.ndarray, "h w"]
     wrapped_rad: Float32[np.ndarray, "h w"]
-    exposure_index: UInt8[np.ndarray, "h w"]
-    """As the first fringes have it."""
 
     @classmethod
     def nothing(cls, decoded: _Decoded, lines_px: Float32[np.ndarray, "h w"]) -> "_Found":
@@ -85,7 +84,6 @@ class _Found:
             residual_cycles=np.full(shape, np.nan, np.float32),
             modulation_gray=np.full(shape, np.nan, np.float32),
             wrapped_rad=np.full(shape, np.nan, np.float32),
-            exposure_index=np.full(shape, _NO_EXPOSURE, np.uint8),
         )
 
     def take(
@@ -109,13 +107,6 @@ class _Found:
             (self.wrapped_rad, phase.wrapped_rad),
         ):
             target[replaced] = source[name][replaced]
-        known = [
-            bands.exposure_index[i] if i < len(bands.exposure_index) else _NO_EXPOSURE
-            for i in range(256)
-        ]
-        self.exposure_index[replaced] = np.array(known, np.uint8)[
-            phase.exposure_index[name][replaced]
-        ]
 
 
 def _decode(one: BandSet, bands: BandFrames, facts: RigFacts, params: BandPhaseParams) -> _Decoded:
@@ -156,7 +147,10 @@ def _merged(
         residual_cycles=mixed(lambda n: phase.residual_cycles[n], lambda f: f.residual_cycles),
         modulation_gray=mixed(lambda n: phase.modulation_gray[n], lambda f: f.modulation_gray),
         wrapped_rad=mixed(lambda n: phase.wrapped_rad[n], lambda f: f.wrapped_rad),
-        exposure_index=mixed(lambda n: phase.exposure_index[n], lambda f: f.exposure_index),
+        exposure_index=mixed(
+            lambda n: phase.exposure_index[n],
+            lambda f: np.full(f.lines_px.shape, _OTHER_EXPOSURE, np.uint8),
+        ),
         reasons=reasons,
         valid_share=float(np.mean([np.mean(r == 0) for r in reasons.values()])),
         median_sigma_px=float(np.median(known)) if known.size else float("nan"),
