@@ -143,16 +143,21 @@ def search_plan(facts: RigFacts, params: BaseExposureParams) -> Plan[BaseExposur
 def _search(
     light: "_Light", grid: ExposureGrid, facts: RigFacts, params: BaseExposureParams
 ) -> Plan[int]:
+    """Lengthen until dark parts are bright enough, and a longer look brings no more of them to light."""
     longest = grid.index(params.longest_ms)
     step = min(grid.index(_FIRST_MS), longest)
+    lit_before = 0
+    target_gray = params.dark_target * min(c.full_scale_gray for c in facts.cameras.values())
     while True:
         dark_rate = yield from _look(light, grid.ms(step), facts, params)
-        target_gray = params.dark_target * min(c.full_scale_gray for c in facts.cameras.values())
         wanted = longest if dark_rate <= 0 else grid.index(target_gray / dark_rate)
         wanted = min(wanted, longest)
-        if wanted <= 1.1 * step:
+        grown = light.lit_count() - lit_before > params.dark_share * light.lit_count()
+        if step == longest or (wanted <= 1.1 * step and not grown):
             return wanted
-        step = min(wanted, grid.index(_STEP * grid.ms(step)))
+        lit_before = light.lit_count()
+        longer = min(grid.index(_STEP * grid.ms(step)), longest)
+        step = longer if wanted <= 1.1 * step else min(wanted, longer)
 
 
 def _look(
@@ -202,6 +207,10 @@ class _Light:
             known |= direct > _SIGMAS * _pair_noise_gray(brightest, facts)
         self.exposure_ms = exposure_ms
         self._saturated = saturated / pixels
+
+    def lit_count(self) -> int:
+        """Return how many pixels have been found to be lit so far."""
+        return sum(int(np.count_nonzero(m)) for m in self.lit.values())
 
     def darkest(self, share: float) -> float:
         """Return the rate that all but the darkest `share` of the lit pixels exceed; 0 if nothing is lit."""
@@ -259,7 +268,7 @@ def _allowed(exposure_ms: float, facts: RigFacts) -> float:
 def _summarise(
     light: _Light, white: Exposed, black: Exposed, facts: RigFacts, params: BaseExposureParams
 ) -> BaseExposure:
-    lit = sum(int(np.count_nonzero(m)) for m in light.lit.values())
+    lit = light.lit_count()
     pixels = sum(m.size for m in light.lit.values())
     if lit == 0:
         raise StageFailedError(
