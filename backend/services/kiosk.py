@@ -1,0 +1,121 @@
+"""A browser window that fills the projector's monitor and shows the projector page, pixel by pixel."""
+
+import html
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlencode
+
+from backend.domain.errors import NotFoundError, StartupError
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+_FLAGS = (
+    "--kiosk", "--force-device-scale-factor=1", "--force-color-profile=srgb",  # no pixel is scaled or converted
+    "--no-first-run", "--noerrdialogs", "--no-default-browser-check", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-infobars", "--disable-session-crashed-bubble",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Monitor:
+    """One monitor of this machine."""
+
+    name: str
+    left_px: int
+    top_px: int
+    width_px: int
+    height_px: int
+
+    def __str__(self) -> str:
+        """Write it as an operator reads it."""
+        return f"{self.name} ({self.width_px}x{self.height_px} at {self.left_px},{self.top_px})"
+
+
+def listed_monitors() -> tuple[Monitor, ...]:
+    """Return the monitors from left to right.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no screen at all.
+    """
+    from screeninfo import ScreenInfoError, get_monitors
+
+    try:
+        found = get_monitors()
+    except ScreenInfoError as error:
+        raise NotFoundError(
+            f"No monitor is found ({error}); run this in a desktop session, or set DISPLAY."
+        ) from error
+    monitors = [Monitor(m.name or "monitor", m.x, m.y, m.width, m.height) for m in found]
+    return tuple(sorted(monitors, key=lambda m: (m.left_px, m.top_px)))
+
+
+class Kiosk:
+    """Starts the browser.
+
+    Parameters
+    ----------
+    folder
+        Profile of the browser; nobody else's settings and extensions take part.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    @staticmethod
+    def choose(monitors: Sequence[Monitor], number: int | None) -> Monitor:
+        """Return a monitor by its number from 1 on, else the last: the projector is the second one.
+
+        Raises
+        ------
+        NotFoundError
+            If there are fewer.
+        """
+        if number is not None and number > len(monitors):
+            names = ", ".join(map(str, monitors))
+            raise NotFoundError(f"There is no monitor {number}; there are: {names}.")
+        return monitors[(number or len(monitors)) - 1]
+
+    def run(self, monitor: Monitor, address: str, *, name: str, token: str | None) -> None:
+        """Show the page until its window is closed.
+
+        Raises
+        ------
+        StartupError
+            If no browser is installed.
+        """
+        subprocess.run(self.command(monitor, address, name=name, token=token), check=False)  # noqa: S603  our own words
+
+    def command(self, monitor: Monitor, address: str, *, name: str, token: str | None) -> list[str]:
+        """Return the browser's command line."""
+        browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+        if browser is None:
+            raise StartupError(
+                f"None of {', '.join(BROWSERS)} is installed; run: apt-get install chromium, or open"
+                f" {address}/projector full screen by hand."
+            )
+        self._folder.mkdir(parents=True, exist_ok=True)
+        return [
+            browser,
+            *_FLAGS,
+            *(
+                ["--no-sandbox"] if os.geteuid() == 0 else []
+            ),  # it refuses to start as root otherwise
+            f"--user-data-dir={self._folder / 'profile'}",
+            f"--window-position={monitor.left_px},{monitor.top_px}",
+            f"--window-size={monitor.width_px},{monitor.height_px}",
+            self._door(address, name, token).as_uri(),
+        ]
+
+    def _door(self, address: str, name: str, token: str | None) -> Path:
+        """Write the page that leads on: a token among a program's arguments could be read by everybody."""
+        query = {"name": name} | ({"token": token} if token else {})
+        target = html.escape(f"{address}/projector?{urlencode(query)}")
+        door = self._folder / "open.html"
+        door.touch(mode=0o600)
+        door.write_text(f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">\n')
+        return door

@@ -1,0 +1,53 @@
+"""The kiosk: which monitor, which command line, and where the token is kept."""
+
+import stat
+from pathlib import Path
+
+import pytest
+
+from backend.domain.errors import NotFoundError, StartupError
+from backend.services.kiosk import Kiosk, Monitor
+
+DESK = Monitor("DP-1", 0, 0, 1920, 1080)
+PROJECTOR = Monitor("HDMI-1", 1920, 0, 1280, 800)
+BOTH = (DESK, PROJECTOR)
+
+
+@pytest.mark.parametrize(("number", "chosen"), [(None, PROJECTOR), (1, DESK), (2, PROJECTOR)])
+def test_the_projector_is_the_last_monitor_unless_it_is_named(
+    number: int | None, chosen: Monitor
+) -> None:
+    assert Kiosk.choose(BOTH, number) is chosen
+
+
+def test_a_monitor_that_isnt_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(NotFoundError, match=r"no monitor 3.*HDMI-1 \(1280x800 at 1920,0\)"):
+        Kiosk.choose(BOTH, 3)
+
+
+def test_the_window_fills_the_monitor_and_the_token_is_no_argument(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("backend.services.kiosk.shutil.which", lambda name: f"/usr/bin/{name}")
+    kiosk = Kiosk(tmp_path / "kiosk")
+    command = kiosk.command(PROJECTOR, "http://127.0.0.1:8000", name="left one", token="se&cret")
+    assert command[0] == "/usr/bin/chromium"
+    assert {
+        "--kiosk",
+        "--window-position=1920,0",
+        "--window-size=1280,800",
+        "--force-device-scale-factor=1",
+    } <= set(command)
+    assert not any("cret" in argument for argument in command)
+    door = tmp_path / "kiosk" / "open.html"
+    assert command[-1] == door.as_uri()
+    assert stat.S_IMODE(door.stat().st_mode) == 0o600
+    assert "/projector?name=left+one&amp;token=se%26cret" in door.read_text()
+
+
+def test_without_a_browser_the_way_out_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("backend.services.kiosk.shutil.which", lambda name: None)
+    with pytest.raises(StartupError, match="apt-get install chromium"):
+        Kiosk(tmp_path).command(DESK, "http://127.0.0.1:8000", name="projector", token=None)
