@@ -66,21 +66,35 @@ def _subtract_rows(deviation: Any, c: Any) -> None:
 def _cell_medians(
     deviation: Float32[np.ndarray, "h w"],
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    rows, columns = (max(1, n // CELL_PX) for n in deviation.shape)
-    # Every fourth pixel each way is enough for a median, and a sixteenth of the work.
-    cells = deviation[: rows * CELL_PX : _EVERY_PX, : columns * CELL_PX : _EVERY_PX]
-    side = CELL_PX // _EVERY_PX
-    if cells.shape != (rows * side, columns * side):
-        return np.empty(0), np.empty(0), np.empty(0)
-    split = cells.reshape(rows, side, columns, side).transpose(0, 2, 1, 3)
-    blocks = split.reshape(rows * columns, side * side)
-    count = np.isfinite(blocks).sum(axis=1)
-    known = np.flatnonzero(count >= _LEAST_SHARE * side * side)
-    ordered, count = np.sort(blocks[known], axis=1), count[known]  # NaN last
-    cell = np.arange(known.size)
-    medians = (ordered[cell, (count - 1) // 2] + ordered[cell, count // 2]) / 2.0
+    rows, columns = (n // CELL_PX for n in deviation.shape)
+    medians = np.empty((rows, columns), np.float32)
+    _median_rows(deviation, medians)
+    y, x = np.nonzero(np.isfinite(medians))
     middle = CELL_PX / 2
-    return known % columns * CELL_PX + middle, known // columns * CELL_PX + middle, medians
+    return x * CELL_PX + middle, y * CELL_PX + middle, medians[y, x].astype(np.float64)
+
+
+@row_loop
+def _median_of_cell(values: Any, y: Any, x: Any, found: Any) -> Any:
+    """Return the median of every fourth pixel each way, a sixteenth of the work; NaN if too few are known."""
+    count = 0
+    for j in range(y, y + CELL_PX, _EVERY_PX):
+        for i in range(x, x + CELL_PX, _EVERY_PX):
+            value = values[j, i]
+            if value == value:  # NaN doesn't equal itself
+                found[count] = value
+                count += 1
+    if count < _LEAST_SHARE * found.size:
+        return np.float32(np.nan)
+    return np.float32(np.median(found[:count]))
+
+
+@kernel
+def _median_rows(values: Any, medians: Any) -> None:
+    for row in numba.prange(medians.shape[0]):
+        found = np.empty((CELL_PX // _EVERY_PX) ** 2, np.float32)
+        for column in range(medians.shape[1]):
+            medians[row, column] = _median_of_cell(values, row * CELL_PX, column * CELL_PX, found)
 
 
 def _terms(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 6"]:

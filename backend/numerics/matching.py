@@ -48,6 +48,7 @@ _NEAR = np.float32(_SAME_PLACE_PX)
 _JUMP_STEPS = 5.0
 _CHECKED_ROWS = 2
 """The check both ways looks at every n-th row of the reference: it asks for a place within pixels."""
+_SPARE_CELLS = 16
 _TILE = 512
 """Pixels whose intermediate rows stay in the first-level cache."""
 _CELLS_MAX = 4
@@ -255,9 +256,9 @@ def _index(
     grid: _Grid,
     jump: float,
     every: int,
-) -> Float32[np.ndarray, "rows cells_1"]:
-    """Note where every n-th row of a canvas crosses the grid's values; the last cell takes what isn't wanted."""
-    index = np.empty((-(-canvas.height_px // every), grid.cells + 1), np.float32)
+) -> Float32[np.ndarray, "rows _cells"]:
+    """Note where every n-th row of a canvas crosses the grid's values; the last cells take what isn't wanted."""
+    index = np.empty((-(-canvas.height_px // every), grid.cells + _SPARE_CELLS), np.float32)
     _index_rows(
         values,
         pixel_of_canvas.nodes,
@@ -275,8 +276,8 @@ def _index(
 class Index(NamedTuple):
     """At which x the rows of both canvases cross each value low + k step; inf where at two places."""
 
-    reference: Any  # float32[rows / _CHECKED_ROWS, cells + 1]
-    other: Any  # float32[rows, cells + 1]
+    reference: Any  # float32[rows / _CHECKED_ROWS, cells + _SPARE_CELLS]
+    other: Any  # float32[rows, cells + _SPARE_CELLS]
 
 
 class Limits(NamedTuple):
@@ -325,8 +326,8 @@ def _note(k: Any, place: Any, out: Any) -> Any:
 @row_loop
 def _crossings(row: Any, place: Any, low: Any, per_step: Any, jump_cells: Any, out: Any) -> Any:
     """Write where the row crosses each value low + k step; inf where it does so at two places."""
-    size = out.size - 1
-    end, spare = np.float32(size), np.uint64(size)
+    size = out.size - _SPARE_CELLS
+    end = np.float32(size)
     for cell in range(out.size):
         out[cell] = _EMPTY
     before = (row[0] - low) * per_step
@@ -338,11 +339,13 @@ def _crossings(row: Any, place: Any, low: Any, per_step: Any, jump_cells: Any, o
             top = np.floor(highest)
             per_cell = (place[i] - place[i - 1]) / difference
             # Mostly none, one or two: written without asking, what isn't crossed into the spare cell. Whether
-            # a value is crossed can't be foreseen, so each question would cost more than the answer.
+            # a value is crossed can't be foreseen, so each question would cost more than the answer. The spare
+            # cells take turns: writing to one that was just written to means waiting for it.
+            spare = np.uint64(size + 2 * (i % (_SPARE_CELLS // 2)))
             for step in range(2):
                 level = top - np.float32(step)
                 crossed = (level >= lowest) & (level >= _ZERO) & (level < end) & (highest > lowest)
-                k = np.uint64(np.int32(level)) if crossed else spare
+                k = np.uint64(np.int32(level)) if crossed else spare + np.uint64(step)
                 _note(k, place[i - 1] + (level - before) * per_cell, out)
             if difference > _TWO or difference < -_TWO:
                 level = top - _TWO
@@ -404,7 +407,10 @@ def _start_row(
     targets: Any, x: Any, line: Any, index: Any, limits: Any, start: Any, second: Any, reasons: Any
 ) -> Any:
     """Look up where to start on each pixel's epipolar line; say whether a pixel has two places."""
-    rows, cells = np.float32(index.other.shape[0]), np.float32(index.other.shape[1] - 2)
+    rows, cells = (
+        np.float32(index.other.shape[0]),
+        np.float32(index.other.shape[1] - _SPARE_CELLS - 1),
+    )
     two_places = False
     for i in range(targets.size):
         start[i] = second[i] = _EMPTY

@@ -20,6 +20,7 @@ from backend.domain.shots import Exposed, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Review
 from backend.numerics.histogram import dark_level, pooled_histogram
+from backend.stages.camera_noise import noise_model
 from backend.stages.intensity_mask import IntensityMask
 
 MAX_CAPTURES = 10
@@ -230,14 +231,9 @@ def saturated_share(exposed: Exposed, facts: RigFacts) -> float:
 
 def _share(frame: Frame, facts: CameraFacts) -> float:
     gray = frame.gray
-    lit = int(
-        np.count_nonzero(gray > facts.black_level_gray + 3.0 * max(1.0, _read_noise_gray(facts)))
-    )
+    dark_gray = facts.black_level_gray + 3.0 * max(1.0, noise_model(facts).read_gray)
+    lit = int(np.count_nonzero(gray > dark_gray))
     return float(np.count_nonzero(gray >= facts.full_scale_gray - 1)) / max(lit, 1)
-
-
-def _read_noise_gray(facts: CameraFacts) -> float:
-    return facts.read_noise_e * facts.full_scale_gray / facts.full_well_e
 
 
 def _allowed(exposure_ms: float, facts: RigFacts) -> float:

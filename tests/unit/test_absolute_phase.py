@@ -71,7 +71,8 @@ def test_both_ways_in_give_the_same_maps():
     for a, b in zip(direct[:6], through[:6], strict=True):
         assert a is not None
         assert b is not None
-        assert np.allclose(a, b, rtol=1e-3, atol=5e-4, equal_nan=True)
+        # rounded phasors may fall into the next cell of the look-up table, which has another second candidate
+        assert np.isclose(a, b, rtol=1e-3, atol=1e-4, equal_nan=True).mean() > 0.998
 
 
 def test_the_fast_path_for_three_frequencies_agrees_with_the_general_one():
@@ -201,6 +202,24 @@ def test_phasors_without_length_are_invalid_and_nothing_crashes():
     assert (decoded.reasons[:2] != 0).all()
     assert np.isnan(decoded.projector_px[:2]).all()
     assert (decoded.reasons[2:] == 0).all()
+
+
+def test_the_wrapped_phase_is_that_of_the_highest_frequency():
+    code = SineCode.equal_steps((59, 70, 64), 4)
+    phasors = fuse_exposures(
+        [Scene(X).frames(code)], code, exposure_ms=[1.0], noise=NOISE, saturation_gray=254
+    )
+    phasors.reasons[3] = int(Reason.SATURATED)
+    decoded = absolute_phase(
+        phasors, code, maximum_likelihood(code.periods), size_px=SIZE_PX, with_wrapped=True
+    )
+    assert decoded.wrapped_rad is not None
+    assert np.isnan(decoded.wrapped_rad[3]).all()
+    wrapped_rad, expected_rad = (
+        np.delete(m, 3, axis=0) for m in (decoded.wrapped_rad, 2 * np.pi * 70 * X)
+    )
+    assert np.abs(np.angle(np.exp(1j * (wrapped_rad - expected_rad)))).max() < 0.02
+    assert np.abs(wrapped_rad).max() <= np.float32(np.pi)
 
 
 def test_maps_are_reused_when_given():
