@@ -19,10 +19,11 @@ from backend.domain.stage import stage
 from backend.domain.states import Level, Review
 from backend.numerics.camera_model import compose, inverse
 from backend.numerics.epipolar_bands import Bands, EpipolarLines, bands_around, epipolar_lines
+from backend.stages.base_exposure import BaseExposure
 from backend.stages.cloud import Cloud
 from backend.stages.exposures import Exposures
 from backend.stages.fringe_phase import AbsolutePhase
-from backend.stages.intensity_mask import IntensityMask
+from backend.stages.pixel_response import PixelResponse
 from backend.stages.pre_exposure import ExposureGrid
 from backend.stages.rig_geometry import (
     from_reference,
@@ -33,6 +34,10 @@ from backend.stages.rig_geometry import (
 
 _NO_EXPOSURE = 255
 _SAMPLE = 2000
+_BRIGHTEST = 0.95
+"""Quantile of the doubtful pixels' response that the exposure is made for."""
+_FULL = 0.9
+"""Share of the full scale that it reaches then."""
 
 
 class BandCaptureParams(Params):
@@ -50,8 +55,8 @@ class BandCaptureParams(Params):
     exposures_ms: tuple[float, ...] | None = setting(
         None, title="Exposures", unit="ms", auto="exposures_ms", min_length=1, max_length=8
     )
-    """Automatic: the one of the first fringes that serves most of the doubtful pixels, or as long as the time
-    budget allows."""
+    """Automatic: one at which the doubtful pixels are bright under full light, as their response tells (else the one of
+    the first fringes that served most of them), as far as the time budget allows."""
     snap: bool = setting(True, title="Whole projector frames", advanced=True)
     """Use multiples of the projector's frame period, so that its modulation averages out."""
     gain_db: float = setting(0.0, title="Camera gain", unit="dB", ge=0, le=48)
@@ -106,7 +111,8 @@ def band_capture(
     phase: AbsolutePhase,
     cloud: Cloud,
     exposures: Exposures,
-    mask: IntensityMask | None,
+    base: BaseExposure | None,
+    response: PixelResponse | None,
     calibration: RigCalibration,
     facts: RigFacts,
     params: BandCaptureParams,
@@ -124,12 +130,17 @@ def band_capture(
         raise StageFailedError(
             "Every pixel with a phase has a point: there is nothing that bands could clear up."
         )
-    masks, dimmed = _masks(phase, doubtful, mask, calibration, params)
+    masks = _masks(phase, doubtful, calibration, params)
     patterns = exposures.design.patterns(facts.projector)
-    frames = 2 * params.bits * len(masks.bands) * len(patterns)
-    times_ms = tuple(sorted(params.exposures_ms or ())) or (
-        _exposure_ms(phase, exposures, doubtful, facts, params, frames=frames, dimmed=dimmed),
-    )
+    times_ms = tuple(sorted(params.exposures_ms or ()))
+    if not times_ms:
+        wanted_ms = _used_ms(phase, exposures, doubtful, facts.reference)
+        if base is not None and response is not None:
+            wanted_ms = _bright_ms(base, response, doubtful, facts)
+        frames = 2 * params.bits * len(masks.bands) * len(patterns)
+        affordable_ms = 1000.0 * params.budget_s / frames
+        grid = ExposureGrid.of(facts, snap=params.snap)
+        times_ms = (grid.ms(grid.index(min(wanted_ms, affordable_ms))),)
     return shoot(capture_plan(patterns, times_ms, masks, params, share))
 
 
@@ -154,26 +165,26 @@ def lines(calibration: RigCalibration, camera: str) -> EpipolarLines:
 
 @dataclass(frozen=True)
 class _Masks:
-    """What the projector may show of its lines."""
+    """What the projector shows of its lines."""
 
-    factor: Float32[np.ndarray, "_h _w"]
-    """The intensity mask, or a single 1."""
     lines: Mapping[str, EpipolarLines]
     bands: Mapping[str, Bands]
 
     def of(self, camera: str, bit: int, *, inverse: bool) -> InMemory:
-        """Return the intensity mask with the other bands dark."""
+        """Return full light with the other bands dark.
+
+        Not the intensity mask: it dims what receives second reflections as well, and time is short here.
+        """
         lit = self.bands[camera].lit(self.lines[camera].projector_px, bit, inverse=inverse)
-        return InMemory(lit.astype(np.float32) * self.factor)
+        return InMemory(lit.astype(np.float32))
 
 
 def _masks(
     phase: AbsolutePhase,
     doubtful: Bool[np.ndarray, "h w"],
-    mask: IntensityMask | None,
     calibration: RigCalibration,
     params: BandCaptureParams,
-) -> tuple[_Masks, float]:
+) -> _Masks:
     """Spread the bands of every camera over the lines that the doubtful pixels' light comes from."""
     reference = calibration.reference
     others = [n for n in phase.projector_px if n != reference and params.cameras == "all"]
@@ -182,8 +193,7 @@ def _masks(
     numbers_px = {name: all_lines[name].projector_px[places] for name in others}
     numbers_px[reference] = all_lines[reference].camera_px[doubtful]
     bands = {name: bands_around(numbers_px[name], params.bits) for name in all_lines}
-    factor, dimmed = _brightened(mask, places)
-    return _Masks(factor, all_lines, bands), dimmed
+    return _Masks(all_lines, bands)
 
 
 def capture_plan(
@@ -243,22 +253,26 @@ def _coordinate(phase: AbsolutePhase, camera: str) -> Float32[np.ndarray, "h w"]
     return phase.projector_px[camera]
 
 
-def _exposure_ms(
-    phase: AbsolutePhase,
-    exposures: Exposures,
-    doubtful: Bool[np.ndarray, "h w"],
-    facts: RigFacts,
-    params: BandCaptureParams,
-    *,
-    frames: int,
-    dimmed: float,
+def _used_ms(
+    phase: AbsolutePhase, exposures: Exposures, doubtful: Bool[np.ndarray, "h w"], camera: str
 ) -> float:
-    """Return the exposure that serves most of the doubtful pixels, or what the budget leaves for each frame."""
-    used = phase.exposure_index[facts.reference][doubtful]
+    """Return the exposure that served most of the doubtful pixels."""
+    used = phase.exposure_index[camera][doubtful]
     counts = np.bincount(used[used != _NO_EXPOSURE], minlength=len(exposures.exposures_ms))
-    wanted_ms = exposures.exposures_ms[int(np.argmax(counts[: len(exposures.exposures_ms)]))]
-    grid = ExposureGrid.of(facts, snap=params.snap)
-    return grid.ms(grid.index(min(dimmed * wanted_ms, 1000.0 * params.budget_s / frames)))
+    return exposures.exposures_ms[int(np.argmax(counts[: len(exposures.exposures_ms)]))]
+
+
+def _bright_ms(
+    base: BaseExposure, response: PixelResponse, doubtful: Bool[np.ndarray, "h w"], facts: RigFacts
+) -> float:
+    """Return the exposure at which the doubtful pixels are bright, but hardly any saturates under full light."""
+    camera = facts.cameras[facts.reference]
+    gain = response.gain[facts.reference][doubtful]
+    gain = gain[np.isfinite(gain)]
+    if gain.size == 0:
+        return base.exposure_ms
+    brightest = 255.0 * float(np.quantile(gain, _BRIGHTEST)) + camera.black_level_gray
+    return base.exposure_ms * _FULL * camera.full_scale_gray / max(brightest, 1.0)
 
 
 class _Places(NamedTuple):
@@ -282,13 +296,3 @@ def _places(
         for number, column in zip(numbers_px, columns, strict=True)
     ]
     return _Places(np.rint(rows).astype(np.int64), columns)
-
-
-def _brightened(
-    mask: IntensityMask | None, places: _Places
-) -> tuple[Float32[np.ndarray, "_h _w"], float]:
-    """Return the mask as bright as the doubtful places allow, and by how much it dimmed them: time is short."""
-    if mask is None:
-        return np.ones((1, 1), np.float32), 1.0
-    dimmed = max(float(np.quantile(mask.factor[places], 0.9)), 1 / 255)
-    return np.minimum(mask.factor.astype(np.float32) / np.float32(dimmed), np.float32(1)), dimmed
