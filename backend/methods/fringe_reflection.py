@@ -10,7 +10,14 @@ from backend.stages.camera_response import camera_response
 from backend.stages.interval import interval
 from backend.stages.linearise import linearise
 from backend.stages.mirror_cloud import mirror_cloud
-from backend.stages.mirror_files import result_npz, summary_json, surface_csv, surface_h5
+from backend.stages.mirror_files import (
+    defects_png,
+    modulation_png,
+    result_npz,
+    summary_json,
+    surface_csv,
+    surface_h5,
+)
 from backend.stages.ramp import Ramp, ramp
 from backend.stages.reflect_capture import reflect_capture, reflect_frames
 from backend.stages.screen_phase import screen_phase
@@ -38,6 +45,8 @@ METHOD = Method(
     files={
         "result.npz": result_npz,
         "summary.json": summary_json,
+        "modulation.png": modulation_png,
+        "defects.png": defects_png,
         "surface.csv": surface_csv,
         "surface.h5": surface_h5,
     },

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
@@ -14,6 +15,8 @@ from backend.stages.slopes import Slopes, second_order
 from backend.stages.surface import Surface
 
 _M = 1e-3
+DEFECT_RANGE = 0.3
+"""Departure from the surroundings that is drawn black or white."""
 
 
 def result_npz(phase: ScreenPhase, slopes: Slopes | None) -> bytes:
@@ -144,6 +147,23 @@ def summary_json(phase: ScreenPhase, slopes: Slopes | None, surface: Surface | N
             },
         }
     return json.dumps(_finite(document), indent=1).encode()
+
+
+def modulation_png(phase: ScreenPhase) -> bytes:
+    """Draw the modulation of the finest fringes, black for none."""
+    values = next(iter(phase.modulation_gray.values()))
+    return _png(values, 0.0, float(np.percentile(values, 99.0)))
+
+
+def defects_png(phase: ScreenPhase) -> bytes:
+    """Draw what differs from its surroundings: dark where the mirror scatters light, gray where it doesn't."""
+    return _png(next(iter(phase.defects.values())), -DEFECT_RANGE, DEFECT_RANGE)
+
+
+def _png(values: Float32[np.ndarray, "h w"], low: float, high: float) -> bytes:
+    share = np.nan_to_num((values - low) / max(high - low, 1e-9), nan=0.0)
+    picture = np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+    return bytes(cv2.imencode(".png", picture)[1])
 
 
 def bad_frames(phase: ScreenPhase) -> list[int]:

@@ -120,7 +120,7 @@ class ScreenPhase:
         Mapping[str, Float32[np.ndarray, "_h _w"]],
         Picture("Defects", unit="of the surroundings", colormap="gray", low=-0.3, high=0.3),
     ]
-    """Contrast of the fringes against its surroundings: scratches, dust and finger prints scatter light."""
+    """Modulation of the finest fringes against its surroundings: scratches, dust and finger prints scatter light."""
     residual_cycles: Annotated[
         Mapping[str, Float32[np.ndarray, "_h _w"]],
         Picture("Contradiction", unit="cycles", colormap="inferno", low=0.0),
@@ -267,13 +267,11 @@ class _Camera:
 
     @property
     def defects(self) -> Float32[np.ndarray, "h w"]:
-        """Contrast of the fringes against its surroundings; NaN off the mirror."""
-        found = self.main
-        contrast = found.modulation_gray / np.maximum(found.mean_gray, np.float32(1.0))
-        contrast[~self.mirror] = np.nan
-        return against_surroundings(
-            contrast, radius_px=max(3.0, DEFECT_RADIUS_SHARE * contrast.shape[1])
-        )
+        """Modulation against its surroundings; NaN off the mirror."""
+        # Not over the mean: light that doesn't come from the screen is no defect.
+        modulation = np.where(self.mirror, self.main.modulation_gray, np.float32(np.nan))
+        radius_px = max(3.0, DEFECT_RADIUS_SHARE * modulation.shape[1])
+        return against_surroundings(modulation, radius_px=radius_px)
 
     def periods(self, axis: str) -> tuple[float, ...]:
         """Period counts along an axis, none if it wasn't coded."""
@@ -291,6 +289,11 @@ def _decode(
     load: LoadArray,
 ) -> _Camera:
     mirror = _mirror_mask(camera, sets, frames, params, load)
+    if not mirror.any():
+        raise StageFailedError(
+            f"Camera {camera!r} sees no pixel of a mirror with the screen in it: move the mirror into view, check the "
+            "light field, or paint the mask."
+        )
     chosen = _telling_pixels(mirror, sets)
     read = _read(sets, chosen, linear, ramp, params)
     closure = set_closures(sets, chosen, read.values)

@@ -30,6 +30,7 @@ from backend.numerics.deflectometry import (
 from backend.numerics.errors import NumericsError, ScreenError
 from backend.numerics.height_grid import HeightGrid
 from backend.numerics.mirror_pose import circle_outline, pose_from_markers, pose_from_outline
+from backend.numerics.screen_phase import check_periods
 from backend.numerics.screen_surface import ScreenSurface, screen_surface
 from backend.numerics.slope_integration import integrate_slopes
 from backend.numerics.surface_maps import curvature
@@ -212,10 +213,15 @@ class _Scene:
         """Collect it, or say what is missing."""
         name = calibration.reference
         model = require_camera(calibration, name)
+        for axis, periods in (("x", phase.periods_x), ("y", phase.periods_y)):
+            if not periods:
+                raise StageFailedError(
+                    f"There are no fringes along {axis}: slopes need places on the screen in x and y."
+                )
+            check_periods(periods)
         if name not in phase.share_x or name not in phase.share_y:
             raise StageFailedError(
-                f"Camera {name!r} has no place on the screen in x and y: slopes need fringes of at most 1 period "
-                "and finer ones in both directions."
+                f"There are no fringes of the reference camera {name!r}: capture them with it too."
             )
         if calibration.screen is None or calibration.screen_from_world is None:
             raise StageFailedError(
