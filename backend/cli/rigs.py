@@ -24,6 +24,7 @@ def register(application: typer.Typer) -> None:
     group.command("add")(add)
     group.command("remove")(remove)
     group.command("check")(check_rig)
+    group.command("latency")(latency)
     application.add_typer(group)
 
 
@@ -72,6 +73,38 @@ def remove(
         answer.update({"name": name, "path": str(left)})
         if not as_json:
             console().print(f"rig {name} is no longer offered; its file is {left}")
+
+
+def latency(
+    rig: Annotated[str, typer.Option(help="Name of a rig that is described by a file.")],
+    repetitions: Annotated[int, typer.Option(min=3, max=100, help="Changes each way.")] = 10,
+    data: DataFolder = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure how long after its acknowledgement the projector shows a pattern, and keep it for the rig."""
+    from dataclasses import asdict
+
+    from backend.cli.house import open_services
+    from backend.services.latency import measure_latency
+
+    quiet_logging()
+    shelf = _shelf(data)
+    shelf.require(rig)
+    with answering(as_json) as answer, open_services(data) as services:
+        found = measure_latency(services.context, rig, {}, _say_progress, repetitions=repetitions)
+        path = found.keep(shelf.folder, rig)
+        answer.update({**asdict(found), "path": str(path)})
+    if as_json:
+        return
+    rows = table(">after acknowledgement", ">black to white", ">white to black")
+    for delay_ms, up, down in zip(found.delays_ms, found.up, found.down, strict=True):
+        rows.add_row(f"{delay_ms:.1f} ms", f"{up:.3f}", f"{down:.3f}")
+    console().print(rows)
+    console().print(f"settle time {found.settle_ms:.1f} ms, kept in {path}")
+
+
+def _say_progress(done: float, text: str = "") -> None:
+    typer.echo(f"{100 * done:3.0f} %  {text}", err=True)
 
 
 def _shelf(data: Path | None) -> "RigShelf":

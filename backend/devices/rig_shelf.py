@@ -1,18 +1,33 @@
 """The rigs of one station: built in, from packages, and the files in its folder."""
 
+import json
 import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import BaseModel, ConfigDict
+
 from backend.devices.errors import RigConfigError, RigNotFoundError
 from backend.devices.loading import available_rigs, open_rig
+from backend.devices.options import DisplaySize
 from backend.devices.pages import PageDesk
 from backend.devices.protocols import Rig
 from backend.devices.rig_file import RigFile, assemble
 
+LATENCY_SUFFIX = ".latency.json"
+"""Beside a rig's file: what the latency calibration found."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,40}")
+
+
+class DisplayMode(BaseModel):
+    """What a measured latency holds for: another monitor or mode has another one."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    size: DisplaySize
+    refresh_hz: float = 60.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +72,25 @@ class RigShelf:
             raise RigConfigError(
                 f"rig {name} is described by {path} and takes no options, but got {', '.join(options)}; edit the file"
             )
-        return assemble(name, RigFile.read(path), self._desk)
+        return assemble(name, self._with_latency(name, RigFile.read(path)), self._desk)
+
+    def _with_latency(self, name: str, file: RigFile) -> RigFile:
+        """Let the projector wait as long as was measured, unless its entry says how long or has changed since."""
+        try:
+            known = json.loads((self._folder / f"{name}{LATENCY_SUFFIX}").read_text())
+            said = dict(file.projector.model_extra or {})
+            same = DisplayMode.model_validate(known) == DisplayMode.model_validate(said)
+        except (OSError, ValueError):
+            return file
+        if not same or "settle_ms" in said:
+            return file
+        projector = file.projector.model_copy(update={"settle_ms": known["settle_ms"]})
+        return file.model_copy(update={"projector": projector})
+
+    @property
+    def folder(self) -> Path:
+        """Where the files are."""
+        return self._folder
 
     def add(self, source: Path, name: str = "") -> KeptRig:
         """Check a file and copy it onto the shelf, under its own name or another one.
@@ -90,8 +123,19 @@ class RigShelf:
         RigNotFoundError
             If there is none of this name.
         """
+        path = self.require(name)
+        return path.rename(path.with_suffix(".yaml.removed"))
+
+    def require(self, name: str) -> Path:
+        """Return the path of a rig's file.
+
+        Raises
+        ------
+        RigNotFoundError
+            If there is none of this name.
+        """
         path = self._folder / f"{name}.yaml"
         if not (_NAME.fullmatch(name) and path.is_file()):
             known = ", ".join(rig.name for rig in self.kept()) or "none"
             raise RigNotFoundError(f"there is no rig file {name!r}; there are: {known}")
-        return path.rename(path.with_suffix(".yaml.removed"))
+        return path

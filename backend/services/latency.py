@@ -1,0 +1,277 @@
+"""Measure how long after its acknowledgement a projector really shows a pattern, by the cameras of its rig."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from backend.devices.protocols import (
+    CameraCapabilities,
+    CameraSettings,
+    Frame,
+    Presented,
+    ProjectorCapabilities,
+)
+from backend.devices.rig_shelf import LATENCY_SUFFIX
+from backend.domain.errors import StageFailedError
+from backend.domain.shots import Progress
+from backend.jobs.rigs import Owner
+from backend.numerics.settling import Settling, changing_pixels, share_of_change
+from backend.services.context import Context
+
+Gray = Float[np.ndarray, "h w"]
+REPETITIONS = 10
+_LONGEST_MS = 400.0
+_AGREEING = 3
+"""So many delays in a row have to be complete before a longer one isn't tried."""
+_STEADY_S = 0.6
+"""After that any display shows what it was asked to."""
+
+
+@runtime_checkable
+class Flashing(Protocol):
+    """What is asked of a projector here; every `Projector` can do it."""
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        """For its refresh rate and size."""
+        ...
+
+    def blank(self, level: int = 0) -> Presented:
+        """Show a level, and return when it is acknowledged."""
+        ...
+
+
+@runtime_checkable
+class Taking(Protocol):
+    """What is asked of a camera here; every `Camera` can do it."""
+
+    @property
+    def name(self) -> str:
+        """For sentences."""
+        ...
+
+    @property
+    def capabilities(self) -> CameraCapabilities:
+        """For its shortest exposure."""
+        ...
+
+    @property
+    def settings(self) -> CameraSettings:
+        """Those in force."""
+        ...
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        """Set the exposure."""
+        ...
+
+    def arm(self, n_frames: int | None = None) -> None:
+        """Start acquisition."""
+        ...
+
+    def trigger(self) -> None:
+        """Start an exposure."""
+        ...
+
+    def get_frame(self, timeout_s: float = 2.0) -> Frame:
+        """Fetch its picture."""
+        ...
+
+    def disarm(self) -> None:
+        """Stop acquisition."""
+        ...
+
+
+@dataclass(frozen=True)
+class Latency:
+    """What was measured; kept beside the rig's file."""
+
+    settle_ms: float
+    """From the acknowledgement on: the slowest change, and one frame period more."""
+    refresh_hz: float
+    size: tuple[int, int]
+    exposure_ms: float
+    delays_ms: tuple[float, ...]
+    up: tuple[float, ...]
+    """Smallest share of the change from black to white that any camera saw at any repetition, for each delay."""
+    down: tuple[float, ...]
+    """The same from white to black."""
+    measured: str
+    """When, in UTC."""
+
+    def keep(self, folder: Path, rig: str) -> Path:
+        """Write it where the rig's file is."""
+        path = folder / f"{rig}{LATENCY_SUFFIX}"
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+        return path
+
+
+def measure_latency(
+    context: Context,
+    name: str,
+    options: Mapping[str, Any],
+    progress: Progress,
+    *,
+    repetitions: int = REPETITIONS,
+) -> Latency:
+    """Measure the latency of a rig's projector, from black to white and back.
+
+    Raises
+    ------
+    RigBusyError
+        If a capture owns the rig.
+    StageFailedError
+        If the cameras don't see the projector's light, or it doesn't settle at all.
+    """
+    with context.rigs.lease(
+        name, options, Owner("", "latency calibration", "rigs latency")
+    ) as lease:
+        return lease.call(
+            lambda rig: latency_of(
+                rig.projector, tuple(rig.cameras.values()), progress, repetitions=repetitions
+            )
+        )
+
+
+def latency_of(
+    projector: Flashing, cameras: Sequence[Taking], progress: Progress, *, repetitions: int
+) -> Latency:
+    """Measure the latency of an opened projector by opened cameras that see its light."""
+    return _Bench(projector, cameras).measure(repetitions, progress)
+
+
+class _Bench:
+    """Projector and cameras while the latency is measured."""
+
+    def __init__(self, projector: Flashing, cameras: Sequence[Taking]) -> None:
+        self._projector = projector
+        self._cameras = tuple(cameras)
+        refresh_hz = projector.capabilities.refresh_hz or 60.0
+        self._period_ms = 1000.0 / refresh_hz
+        self._exposure_ms = self._shortest_exposure()
+
+    def measure(self, repetitions: int, progress: Progress) -> Latency:
+        """Take the pictures and judge them."""
+        projector = self._projector
+        known = getattr(projector, "settle_ms", None)
+        if hasattr(projector, "settle_ms"):
+            projector.settle_ms = 0.0
+        try:
+            self._arm()
+            steady = {level: self._pictures(level, _STEADY_S) for level in (0, 255)}
+            self._refuse_darkness(steady)
+            changes = {
+                target: self._settling(target, steady, repetitions, progress) for target in (255, 0)
+            }
+        finally:
+            if hasattr(projector, "settle_ms"):
+                projector.settle_ms = known
+            for camera in self._cameras:
+                camera.disarm()
+            projector.blank()
+        return self._latency(changes[255], changes[0])
+
+    def _shortest_exposure(self) -> float:
+        """Return the fewest whole periods that the cameras allow."""
+        low_ms = max(c.capabilities.exposure_us.min for c in self._cameras) / 1000.0
+        return self._period_ms * max(1, int(np.ceil(low_ms / self._period_ms - 1e-9)))
+
+    def _arm(self) -> None:
+        for camera in self._cameras:
+            camera.configure(
+                replace(camera.settings, exposure_us=round(self._exposure_ms * 1000.0, 3))
+            )
+            camera.arm()
+
+    def _pictures(self, level: int, delay_s: float) -> list[Gray]:
+        """Show a level, wait from its acknowledgement on, and take one picture with each camera."""
+        self._projector.blank(level)
+        acknowledged_s = time.monotonic()
+        time.sleep(max(0.0, delay_s - (time.monotonic() - acknowledged_s)))
+        for camera in self._cameras:
+            camera.trigger()
+        return [_gray(camera) for camera in self._cameras]
+
+    def _refuse_darkness(self, steady: Mapping[int, list[Gray]]) -> None:
+        for camera, dark, bright in zip(self._cameras, steady[0], steady[255], strict=True):
+            if np.count_nonzero(self._lit(dark, bright)) < 100:
+                raise StageFailedError(
+                    f"Camera {camera.name} doesn't see the projector's light at {self._exposure_ms:.1f} ms: put a bright"
+                    " surface before it, open the aperture, or check what the projector shows."
+                )
+
+    def _lit(self, dark: Gray, bright: Gray) -> Bool[np.ndarray, "h w"]:
+        full_scale_gray = 255.0 if bright.max() <= 255 else 4095.0
+        return changing_pixels(dark, bright, full_scale_gray=full_scale_gray)
+
+    def _settling(
+        self,
+        target: int,
+        steady: Mapping[int, list[Gray]],
+        repetitions: int,
+        progress: Progress,
+    ) -> Settling:
+        """Try longer delays until several in a row show the whole change every time."""
+        delays_ms: list[float] = []
+        shares: list[list[list[float]]] = []
+        what = "black to white" if target else "white to black"
+        while len(delays_ms) < _AGREEING or min(map(_worst, shares[-_AGREEING:])) < 0.985:
+            delay_ms = len(delays_ms) * self._period_ms / 2
+            if delay_ms > _LONGEST_MS:
+                raise StageFailedError(
+                    f"The projector doesn't settle within {_LONGEST_MS:g} ms from {what}: check that the cameras see its"
+                    " screen and that nothing else changes the light."
+                )
+            progress(
+                min(delay_ms / 150.0, 0.95), f"{what}, {delay_ms:.0f} ms after the acknowledgement"
+            )
+            shares.append([self._shares(target, steady, delay_ms) for _ in range(repetitions)])
+            delays_ms.append(delay_ms)
+        return Settling(np.array(delays_ms), np.array(shares).transpose(1, 2, 0))
+
+    def _shares(
+        self, target: int, steady: Mapping[int, list[Gray]], delay_ms: float
+    ) -> list[float]:
+        start = 255 - target
+        self._projector.blank(start)
+        time.sleep(_STEADY_S)
+        pictures = self._pictures(target, delay_ms / 1000.0)
+        return [
+            share_of_change(gray, before, after, self._lit(dark, bright))
+            for gray, before, after, dark, bright in zip(
+                pictures, steady[start], steady[target], steady[0], steady[255], strict=True
+            )
+        ]
+
+    def _latency(self, up: Settling, down: Settling) -> Latency:
+        longest = max(up.delays_ms, down.delays_ms, key=len)
+        return Latency(
+            settle_ms=max(up.over_ms, down.over_ms) + self._period_ms,
+            refresh_hz=1000.0 / self._period_ms,
+            size=self._projector.capabilities.size,
+            exposure_ms=self._exposure_ms,
+            delays_ms=tuple(longest.tolist()),
+            up=_smallest(up, longest.size),
+            down=_smallest(down, longest.size),
+            measured=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
+
+
+def _gray(camera: Taking) -> Gray:
+    return camera.get_frame().data.astype(np.float64)
+
+
+def _worst(repetitions: list[list[float]]) -> float:
+    return min(min(cameras) for cameras in repetitions)
+
+
+def _smallest(settling: Settling, count: int) -> tuple[float, ...]:
+    """Return the smallest share at each delay; after the last one tried, the change is over."""
+    worst = settling.shares.min(axis=(0, 1))
+    return tuple(np.append(worst, np.ones(count - worst.size)).round(4).tolist())

@@ -1,0 +1,139 @@
+"""The latency calibration, on a screen that lags by a known time and cameras that integrate its light."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from backend.devices.drivers.page_projector import PageProjector
+from backend.devices.pages import PageDesk
+from backend.devices.protocols import (
+    CameraCapabilities,
+    CameraSettings,
+    Frame,
+    Presented,
+    ProjectorCapabilities,
+    Range,
+)
+from backend.devices.rig_shelf import RigShelf
+from backend.domain.errors import StageFailedError
+from backend.numerics.settling import Settling, first_complete_ms
+from backend.services import latency
+
+PERIOD_S = 1 / 240
+
+
+class LaggingScreen:
+    """Acknowledges at once, and changes `lag_s` later."""
+
+    capabilities = ProjectorCapabilities(size=(64, 48), refresh_hz=240.0)
+
+    def __init__(self, lag_s: float) -> None:
+        self.lag_s = lag_s
+        self.settle_ms: float | None = 99.0
+        self.changes: list[tuple[float, int]] = [(0.0, 0)]
+
+    def blank(self, level: int = 0) -> Presented:
+        if self.settle_ms:
+            time.sleep(self.settle_ms / 1000.0)
+        self.changes.append((time.monotonic() + self.lag_s, level))
+        return Presented(-1, time.monotonic(), None, confirmed=False)
+
+    def light(self, start_s: float, end_s: float) -> float:
+        """Return the mean level over a time."""
+        times = [t for t, _ in self.changes] + [np.inf]
+        total = sum(
+            level * max(0.0, min(end_s, after) - max(start_s, at))
+            for (at, level), after in zip(self.changes, times[1:], strict=True)
+        )
+        return total / (end_s - start_s)
+
+
+class Camera:
+    """Sees the screen on a part of its picture."""
+
+    capabilities = CameraCapabilities((32, 24), ("Mono8",), Range(1000, 1e6), Range(0, 0), ())
+
+    def __init__(self, name: str, screen: LaggingScreen, gray: float = 200.0) -> None:
+        self.name, self._screen, self._gray = name, screen, gray
+        self.settings = CameraSettings(1000.0)
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        self.settings = replace(self.settings, exposure_us=settings.exposure_us)
+        return self.settings
+
+    def arm(self, n_frames: int | None = None) -> None: ...
+    def disarm(self) -> None: ...
+
+    def trigger(self) -> None:
+        now_s = time.monotonic()
+        end_s = now_s + self.settings.exposure_us * 1e-6
+        time.sleep(end_s - now_s)
+        self._light = self._screen.light(now_s, end_s)
+
+    def get_frame(self, timeout_s: float = 2.0) -> Frame:
+        picture = np.full((24, 32), 4.0)
+        picture[4:20, 4:28] += self._gray * self._light / 255.0
+        return Frame(
+            picture.round().astype(np.uint8),
+            "Mono8",
+            8,
+            0,
+            self.settings.exposure_us,
+            0.0,
+            None,
+            0.0,
+        )
+
+
+def _silent(done: float, text: str = "") -> None:
+    """Nobody listens."""
+
+
+def measured(lag_s: float, monkeypatch: pytest.MonkeyPatch, gray: float = 200.0) -> latency.Latency:
+    monkeypatch.setattr(latency, "_STEADY_S", 0.08)
+    screen = LaggingScreen(lag_s)
+    cameras = [Camera(name, screen, gray) for name in ("left", "right")]
+    try:
+        return latency.latency_of(screen, cameras, _silent, repetitions=2)
+    finally:
+        assert screen.settle_ms == 99.0
+
+
+@pytest.mark.parametrize("lag_ms", [0.0, 20.0])
+def test_the_lag_is_found_and_a_period_more_is_waited(
+    lag_ms: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = measured(lag_ms / 1000.0, monkeypatch)
+    assert lag_ms - 2.1 <= found.settle_ms - 1000 * PERIOD_S <= lag_ms + 12.0
+    assert found.up[-1] > 0.98
+    assert found.down[-1] > 0.98
+
+
+def test_cameras_that_see_nothing_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(StageFailedError, match="Camera left doesn't see the projector's light"):
+        measured(0.0, monkeypatch, gray=1.0)
+
+
+def test_a_change_counts_as_over_when_all_cameras_and_repetitions_agree() -> None:
+    shares = np.ones((2, 2, 4))
+    shares[1, 0, 1] = 0.9
+    assert Settling(np.array([0.0, 8.0, 17.0, 25.0]), shares).over_ms == 17.0
+    shares[0, 1, 3] = 0.5
+    assert np.isnan(first_complete_ms(np.array([0.0, 8.0, 17.0, 25.0]), shares))
+
+
+@pytest.mark.parametrize(("size", "settles"), [("64x48", 29.2), ("128x96", None)])
+def test_it_holds_for_the_mode_that_it_was_measured_in(
+    size: str, settles: float | None, tmp_path: Path
+) -> None:
+    shelf = RigShelf(tmp_path, PageDesk())
+    text = f"cameras: {{left: {{driver: aravis, address: 192.0.2.2}}}}\nprojector: {{driver: page, size: {size}, refresh_hz: 240}}"
+    (tmp_path / "bench.yaml").write_text(text)
+    found = latency.Latency(29.2, 240.0, (64, 48), 4.2, (0.0,), (1.0,), (1.0,), "2026-11-23")
+    found.keep(shelf.folder, "bench")
+    projector = shelf.open("bench", {}).projector
+    assert isinstance(projector, PageProjector)
+    assert projector.settle_ms == settles
