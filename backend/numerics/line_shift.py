@@ -25,8 +25,9 @@ from backend.numerics.uncertainty import NoiseModel
 LEAST_SHIFTS = 4
 """Fewer positions of the stripes don't show the edge's surroundings."""
 _MOST_SHIFTS = 64
-_REACH_PX = 1.5
-"""Width of the filter that finds the edge: wider takes in more noise and stray light, narrower less light."""
+_REACH_PX = 2.0
+"""Width of the filter that finds the edge: wider takes in more stray light, narrower less of the light, and follows
+every ripple of its picture."""
 _NEWTON_STEPS = 3
 _NEAR_PX = 3.0
 """Light within this distance of the edge is its own."""
@@ -135,7 +136,7 @@ def decode_line_shift(
     don't matter, and nothing is interpolated across a jump; (b) the blurred edge isn't taken for straight, which
     would leave a ripple of 0.02 px; (c) offsets between pattern and inverse cancel, as of light that
     is reflected twice; (d) steps of the mask don't drag the edge along. With white noise the standard deviation is
-    about :math:`1.1 \, \sigma_D / A` for a blur of 0.8 px, A being the largest difference.
+    about :math:`\sigma_D / A` for a blur of 0.8 px, A being the largest difference.
     """
     limits = limits or LineShiftLimits()
     stack = _checked(patterns, inverses, stripes, coarse_px)
@@ -177,7 +178,7 @@ def decode_line_shift(
 
 def reach_of(stripes: Stripes) -> float:
     """Return the width of the filter that finds the edge, in shifts of the stripes."""
-    return float(np.clip(_REACH_PX / stripes.step_px, 1.0, max(stripes.shifts / 5, 1.0)))
+    return float(np.clip(_REACH_PX / stripes.step_px, 1.0, max(stripes.shifts / 4, 1.0)))
 
 
 def _checked(

@@ -119,6 +119,13 @@ def _sample(values: Any, x: Any, y: Any, jump: Any) -> Any:
 
 
 @row_loop
+def _averaging(place: Any) -> Any:
+    """Return by which factor interpolation between two neighbours lowers their noise."""
+    t = place - np.floor(place)
+    return np.sqrt((1.0 - t) * (1.0 - t) + t * t)
+
+
+@row_loop
 def _disagreement(
     X: Any, Y: Any, Z: Any, coordinate: Any, other: Any, projector: Any, jump: Any
 ) -> Any:
@@ -143,7 +150,7 @@ def _ask(
             return np.nan, np.nan
         scale -= step
     x, y = _project(X * scale, Y * scale, Z * scale, other)
-    noise = _sample(sigma, x, y, np.inf) / abs(slope)
+    noise = _sample(sigma, x, y, np.inf) * _averaging(x) * _averaging(y) / abs(slope)
     return (scale - 1.0, noise) if noise == noise else (np.nan, np.nan)
 
 

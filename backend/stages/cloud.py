@@ -68,6 +68,10 @@ class Cloud:
     """Disagreement of the frequencies that was allowed, in [cycles]; infinite if it wasn't judged."""
     speck_px: int = 0
     """Smallest patch of connected pixels that was kept."""
+    epipolar_sigma_px: Annotated[
+        float, Value("Row against epipolar line, robust spread", unit="px")
+    ] = float("nan")
+    """How well the projector's rows as read agree with the calibration; NaN without a row code."""
     cameras: tuple[str, ...] = ()
     """The cameras that the points were made from, the reference first."""
 

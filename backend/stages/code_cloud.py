@@ -138,6 +138,8 @@ class _PixelPoints:
     sigma_px: float
     """Robust standard deviation of the row's residual: how well code and calibration agree."""
     removed: tuple[FilterRow, ...]
+    epipolar_sigma_px: float = float("nan")
+    """The same of all pixels, before any is removed."""
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"]:
@@ -159,9 +161,10 @@ def _pixel_points(codes: Codes, rig: _Pair, params: CodeCloudParams) -> _PixelPo
     residual_px = projector_consistency(
         points_mm, rows, rig.projector, rig.projector_from_camera, rows=True
     )
+    spread_px = _robust_sigma(residual_px[(reasons == 0) & np.isfinite(residual_px)])
     off = _reject(reasons, ~(np.abs(residual_px) <= _epipolar_px(params)), Reason.EPIPOLAR)
     sigma_px = max(_ROUNDING_PX, _robust_sigma(residual_px[reasons == 0]))
-    return _PixelPoints(points_mm, reasons, sigma_px, (clipped, off))
+    return _PixelPoints(points_mm, reasons, sigma_px, (clipped, off), spread_px)
 
 
 def _reject(
@@ -289,4 +292,5 @@ def _cloud(
         kept_share=int(np.count_nonzero(pixels.valid)) / max(decoded, 1),
         cameras=(rig.name,),
         consistency_px=epipolar_px if rig.name in codes.projector_row_px else float("nan"),
+        epipolar_sigma_px=pixels.epipolar_sigma_px,
     )

@@ -74,6 +74,9 @@ class _View:
     reasons: UInt16[np.ndarray, "h w"]
     rows: list[FilterRow]
     epipolar_px: float
+    """Contradiction of row and epipolar line that was allowed."""
+    spread_px: float = float("nan")
+    """Robust standard deviation of that contradiction."""
 
     def reject(self, bad: Bool[np.ndarray, "h w"], reason: Reason, title: str) -> None:
         """Remove the points of these pixels, note why, and count them."""
@@ -138,8 +141,8 @@ def _check_rows(codes: Codes, view: _View, params: DenseParams) -> None:
         )
     )
     known = residual_px[np.isfinite(residual_px)][::7]
-    spread_px = 1.4826 * float(np.median(known)) if known.size else 0.0
-    view.epipolar_px = params.epipolar_px or max(_SPREADS * spread_px, _LEAST_SPREAD_PX)
+    view.spread_px = 1.4826 * float(np.median(known)) if known.size else 0.0
+    view.epipolar_px = params.epipolar_px or max(_SPREADS * view.spread_px, _LEAST_SPREAD_PX)
     view.reject(
         residual_px > view.epipolar_px, Reason.EPIPOLAR, f"{view.name}: off the epipolar line"
     )
@@ -189,8 +192,9 @@ def _distance_mm(points: OrganisedCloud) -> Float32[np.ndarray, "h w"]:
 
 
 def _fill(view: _View, other: _View, camera_from_other: RigidTransform) -> None:
-    """Take the other camera's points for pixels that have none."""
-    wanted = np.asarray(~np.isfinite(view.points.depth_mm))
+    """Take the other camera's points for pixels that have none, but where the two contradict each other."""
+    disputed = (view.reasons & np.uint16(Reason.LEFT_RIGHT_CHECK)) != 0
+    wanted = np.asarray(~np.isfinite(view.points.depth_mm) & ~disputed)
     found = np.isfinite(other.points.depth_mm)
     organised_mm = other.points.points_mm
     R, t_mm = camera_from_other
@@ -255,4 +259,5 @@ def _cloud(codes: Codes, view: _View, names: tuple[str, ...]) -> Cloud:
         kept_share=count / max(decoded, 1),
         cameras=names,
         consistency_px=view.epipolar_px,
+        epipolar_sigma_px=view.spread_px,
     )
