@@ -152,3 +152,10 @@ def smooth(factor: Float32[np.ndarray, "h w"], sigma_px: float) -> Float32[np.nd
         logarithm, 2 * int(np.ceil(2 * sigma_px)) + 1, _LOG_EDGE, sigma_px
     )
     return np.asarray(np.exp(smoothed), np.float32)
+
+
+def evened(factor: Float32[np.ndarray, "h w"], sigma_px: float) -> Float32[np.ndarray, "h w"]:
+    """Smooth a mask's logarithm with a Gaussian of a standard deviation, steps as well."""
+    logarithm = np.log(np.maximum(factor, np.float32(1e-4)))
+    blurred = cv2.GaussianBlur(logarithm, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(np.exp(blurred), np.float32)

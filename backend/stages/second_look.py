@@ -19,7 +19,7 @@ from backend.domain.states import Level, Review
 from backend.numerics.code_certainty import PairGeometry, on_epipolar_line
 from backend.numerics.epipolar_bands import EpipolarLines, epipolar_lines
 from backend.numerics.errors import CalibrationError
-from backend.numerics.intensity_mask import light_at, scatter, widen_dark
+from backend.numerics.intensity_mask import evened, light_at, scatter, widen_dark
 from backend.numerics.second_look import Looks, possible_places, second_light
 from backend.numerics.triangulation import projector_consistency, triangulate_projector
 from backend.stages.base_exposure import BaseExposure
@@ -38,7 +38,7 @@ _MARGIN_PX = 2.0
 _TARGET = 0.85
 """Share of the full scale that the second look may bring a pixel to."""
 _MOST_RAISE = np.float32(6.0)
-_WIDENED_PX = 1.5
+_SMOOTHING_PX = 3.0
 _UNTOLD, _SECOND_LIGHT, _TOLD_NOW = 1, 2, 3
 LABELS = {
     _UNTOLD: "no code that agrees with the calibration, or none at all",
@@ -58,9 +58,9 @@ class SecondLookParams(EdgesParams):
     """Share of its light from which a pixel is looked at again: it moves stripe edges."""
     epipolar_px: float = setting(2.5, title="Row against epipolar line", unit="px", gt=0, le=1000)
     """A code that misses its epipolar line by more came by a second reflection."""
-    bands: int = setting(8, title="Looks", ge=2, le=32)
+    bands: int = setting(12, title="Looks", ge=2, le=32)
     """Each lights one of so many bands of epipolar lines, and takes a picture of every column pattern."""
-    band_px: float = setting(10.0, title="Width of a band", unit="px", ge=2, le=200)
+    band_px: float = setting(6.0, title="Width of a band", unit="px", ge=2, le=200)
     """In projector pixels. Narrow bands part places that are near each other, as in a corner."""
 
 
@@ -239,10 +239,13 @@ class _Look:
         share = np.where(wanted, given * room / signal, np.float32(np.nan))
         most = np.full(factor.shape, np.inf, np.float32)
         scatter(share, columns, rows, into=most)
-        known = np.where(np.isinf(most), np.float32(1), most)
-        widened = np.minimum(widen_dark(known, _WIDENED_PX), most)
-        raised = np.clip(widened, factor, np.minimum(_MOST_RAISE * factor, 1))
-        return np.where(np.isinf(most), factor, raised).astype(np.float32)
+        known = np.where(np.isinf(most), np.minimum(_MOST_RAISE * factor, 1), most).astype(
+            np.float32
+        )
+        # Smooth, as edges move where the light changes within the projector's blur; widened before, so that
+        # smoothing dazzles nobody.
+        even = evened(widen_dark(known, _SMOOTHING_PX), _SMOOTHING_PX)
+        return np.asarray(np.clip(even, 0, np.minimum(_MOST_RAISE * factor, 1)), np.float32)
 
     def _depths_mm(self) -> tuple[float, float]:
         """Return between which depths surfaces are: those of the pixels told, and a little more."""
