@@ -7,7 +7,7 @@ from app.desk import Desk
 from app.look import Look, fields_of_kind
 from app.panels.pictures import is_live
 from app.space import UNIT, Placement, Space
-from app.views.frustums import FrustumsView, Placed, aim_mm, placed_devices
+from app.views.frustums import FrustumsView, Placed, aim_mm, mirror_of, placed_devices
 from backend.contract.rigs import RigView
 
 _PICTURE_PX = 512
@@ -57,7 +57,9 @@ class RigPanel:
         devices = placed_devices(rig) if rig else []
         if devices:
             self._place(devices)
-            self._frustums = FrustumsView(self._space.scene, self._space.root, devices, unit=UNIT)
+            self._frustums = FrustumsView(
+                self._space.scene, self._space.root, devices, unit=UNIT, rig=rig
+            )
 
     def show_live(self, camera: str, jpeg: bytes) -> None:
         """Show the newest picture of a camera."""
@@ -66,7 +68,7 @@ class RigPanel:
             self._frustums.show_picture(camera, jpeg)
 
     def _place(self, devices: list[Placed]) -> None:
-        aim, direction = aim_mm(devices)
+        aim, direction = aim_mm(devices, mirror_of(self.rig))
         cameras = [d for d in devices if d.is_camera] or devices
         right = np.mean([d.R[:, 0] for d in cameras], axis=0)
         reach = float(np.mean([np.linalg.norm(aim - d.centre_mm) for d in devices])) * UNIT

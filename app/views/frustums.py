@@ -57,6 +57,11 @@ def placed_devices(rig: RigView) -> list[Placed]:
     return found
 
 
+def mirror_of(rig: RigView | None) -> Array | None:
+    """Return the middle of the mirror under test; None where there is none."""
+    return None if rig is None or rig.mirror_mm is None else np.array(rig.mirror_mm)
+
+
 def _placed(
     name: str,
     label: str,
@@ -72,16 +77,18 @@ def _placed(
     )
 
 
-def aim_mm(devices: list[Placed]) -> tuple[Array, Array]:
+def aim_mm(devices: list[Placed], mirror_mm: Array | None = None) -> tuple[Array, Array]:
     """Return where the cameras look at, and the mean direction they look in.
 
-    One camera alone (or parallel ones) looks at 500 mm: a guess that only places the view.
+    One camera alone (or parallel ones) looks at the mirror, or at 500 mm: a guess that only places the view.
     """
     cameras = [d for d in devices if d.is_camera] or devices
     axes = np.array([d.R[:, 2] for d in cameras])
     centres = np.array([d.centre_mm for d in cameras])
     direction = axes.mean(axis=0)
     direction /= np.linalg.norm(direction)
+    if mirror_mm is not None:
+        return mirror_mm, direction
     # The point nearest to all axes: sum over (1 - a a^T) (x - c) = 0.
     across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
     system, right = across.sum(axis=0), np.einsum("nij,nj->i", across, centres)
@@ -103,17 +110,27 @@ class FrustumsView:
         Node that turns the rig's world into the scene's.
     unit
         Scene units per mm.
+    rig
+        What else is drawn: its screen, and the mirror that cameras look at.
     """
 
     def __init__(
-        self, scene: viser.SceneApi, parent: str, devices: list[Placed], *, unit: float
+        self,
+        scene: viser.SceneApi,
+        parent: str,
+        devices: list[Placed],
+        *,
+        unit: float,
+        rig: RigView | None = None,
     ) -> None:
-        aim, _ = aim_mm(devices)
+        aim, _ = aim_mm(devices, mirror_of(rig))
         self._handles: dict[str, Any] = {}
         self._nodes: list[Any] = []
         for device in devices:
             distance = float(np.linalg.norm(aim - device.centre_mm))
             self._add(scene, f"{parent}/rig/{device.name.strip()}", device, distance, unit)
+        if rig is not None and rig.screen_mm:
+            self._add_screen(scene, f"{parent}/rig/screen ", unit * np.array(rig.screen_mm))
 
     @property
     def cameras(self) -> list[str]:
@@ -142,6 +159,20 @@ class FrustumsView:
         for node in self._nodes:
             node.remove()
         self._nodes, self._handles = [], {}
+
+    def _add_screen(self, scene: viser.SceneApi, node: str, edge: Array) -> None:
+        ways = np.stack([edge, np.roll(edge, -1, axis=0)], axis=1)
+        colour = np.array(rgb(PROJECTOR), np.uint8)
+        lines = scene.add_line_segments(node, ways, colour, thickness=1.6, thickness_units="screen")
+        # The first corner is the pattern's: upper left as the mirror sees the screen.
+        label = scene.add_label(
+            f"{node}/label",
+            "screen",
+            anchor="bottom-center",
+            font_screen_scale=0.95,
+            position=edge[0],
+        )
+        self._nodes += [label, lines]
 
     def _add(
         self, scene: viser.SceneApi, node: str, device: Placed, distance_mm: float, unit: float

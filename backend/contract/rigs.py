@@ -53,6 +53,10 @@ class RigView(Message):
     reference: str
     cameras: tuple[CameraView, ...]
     projector: ProjectorView | None
+    screen_mm: tuple[tuple[float, float, float], ...] = ()
+    """Edge of the display that the part is seen with, once around, in the world; empty where there is none."""
+    mirror_mm: tuple[float, float, float] | None = None
+    """Middle of the mirror under test, in the world; None where it isn't known."""
 
 
 class RigOffer(Message):

@@ -22,6 +22,9 @@ from backend.services.context import Context
 from backend.services.previews import live_jpeg
 from backend.storage.codec import decode
 
+_PER_EDGE = 8
+"""Points that an edge of a bent screen is drawn with."""
+
 
 def view_rig(context: Context, name: str, options: Mapping[str, Any]) -> RigView:
     """Describe a rig with its options; opens it unless it is known already."""
@@ -77,7 +80,37 @@ def rig_view(name: str, title: str, options: Mapping[str, Any], rig: RigGiven) -
         reference=rig.facts.reference,
         cameras=tuple(_camera(camera, rig) for camera in rig.facts.cameras),
         projector=_projector(rig),
+        screen_mm=_screen_edge(rig.calibration),
+        mirror_mm=_mirror_middle(rig.calibration),
     )
+
+
+def _screen_edge(calibration: RigCalibration | None) -> tuple[tuple[float, float, float], ...]:
+    """Return the known points of the screen that are nearest to places around its edge, in the world."""
+    if calibration is None or calibration.screen is None or calibration.screen_from_world is None:
+        return ()
+    along, there, back = (
+        np.linspace(0, 1, _PER_EDGE, endpoint=False),
+        np.ones(_PER_EDGE),
+        np.zeros(_PER_EDGE),
+    )
+    x = np.concatenate([along, there, 1 - along, back])
+    y = np.concatenate([back, along, there, 1 - along])
+    shares, pose = calibration.screen.shares, calibration.screen_from_world
+    nearest = [
+        int(np.argmin(((shares - place) ** 2).sum(axis=1))) for place in zip(x, y, strict=True)
+    ]
+    kept = [k for i, k in enumerate(nearest) if k != nearest[i - 1]]
+    world = (calibration.screen.points_mm[kept] - pose.t_mm) @ pose.R
+    return tuple((float(p[0]), float(p[1]), float(p[2])) for p in world)
+
+
+def _mirror_middle(calibration: RigCalibration | None) -> tuple[float, float, float] | None:
+    pose = calibration.mirror_from_world if calibration else None
+    if pose is None:
+        return None
+    x, y, z = (-pose.R.T @ pose.t_mm).tolist()
+    return x, y, z
 
 
 def _camera(name: str, rig: RigGiven) -> CameraView:
