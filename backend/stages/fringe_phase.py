@@ -180,7 +180,7 @@ def _summarise(
     first = first_of_each_camera(phasors.sets)
     sigma = {n: _sigma(d) for n, d in main.items()}
     valid = sum(int(np.count_nonzero(d.reasons == 0)) for d in main.values())
-    some = np.concatenate([s.ravel()[::7] for s in sigma.values()])
+    some = np.concatenate([s.ravel()[:: max(1, s.size // 100_000)] for s in sigma.values()])
     finite = some[np.isfinite(some)]
     return AbsolutePhase(
         projector_px={n: d.projector_px for n, d in decoded["x"].items()},

@@ -397,7 +397,7 @@ class _Scene:
 
 
 def _usual_spread(contradiction_px: Float32[np.ndarray, "h w"]) -> float:
-    some = contradiction_px.ravel()[::11]
+    some = contradiction_px.ravel()[:: max(1, contradiction_px.size // 100_000)]
     known = np.abs(some[np.isfinite(some)])
     spread_px = 1.4826 * float(np.median(known)) if known.size else 0.0
     return max(SPREADS * spread_px, LEAST_SPREAD_PX)
