@@ -4,7 +4,7 @@ import io
 import json
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 from urllib.parse import quote, urlencode
 
@@ -90,6 +90,20 @@ class PointsPreview:
     colour: Array | None
     """n x 3 uint8, if the cloud has a colour."""
     scalars: tuple[ScalarOfPoints, ...]
+
+    def with_more(self, more: "PointsPreview") -> "PointsPreview":
+        """Return both together; what the ends of the colours mean stays."""
+        if not len(more.points_mm):
+            return self
+        colour = None
+        if self.colour is not None and more.colour is not None:
+            colour = np.concatenate([self.colour, more.colour])
+        scalars = tuple(
+            replace(mine, values=np.concatenate([mine.values, other.values]))
+            for mine, other in zip(self.scalars, more.scalars, strict=True)
+        )
+        points_mm = np.concatenate([self.points_mm, more.points_mm])
+        return PointsPreview(self.total, points_mm, colour, scalars)
 
 
 class ApiClient:
@@ -245,10 +259,11 @@ class ApiClient:
         answer = self._http.post("/api/artifacts", content=file.getvalue())
         return _REFERENCE.validate_json(_checked(answer).content)
 
-    def points(self, stage_run: str, field: str, *, budget: int) -> PointsPreview:
-        """Return a cloud with all its scalars, thinned to at most `budget` points."""
+    def points(self, stage_run: str, field: str, *, budget: int, beyond: int = 0) -> PointsPreview:
+        """Return a cloud with all its scalars, thinned to at most `budget` points, without those `beyond` brings."""
         path = f"/api/stage-runs/{quote(stage_run)}/fields/{quote(field)}/points"
-        return unpack_points(_checked(self._http.get(path, params={"budget": budget})).content)
+        query = {"budget": budget, "beyond": beyond}
+        return unpack_points(_checked(self._http.get(path, params=query)).content)
 
     def picture(self, address: str) -> bytes:
         """Return the bytes of a picture whose address this module gave out."""

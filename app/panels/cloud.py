@@ -1,7 +1,7 @@
 """Cloud and mesh in the scene, and the small panel that says what their colours mean."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,8 @@ from app.views import points as points_view
 from app.views.points import Ground, Mode
 from backend.contract.scans import FieldView, StageState
 
-LIVE_BUDGET, REVIEW_BUDGET, FULL_BUDGET = 300_000, 1_000_000, 3_000_000
+FIRST_BUDGET, LIVE_BUDGET, REVIEW_BUDGET, FULL_BUDGET = 60_000, 300_000, 1_000_000, 3_000_000
+"""Points that come at once, and those that come after them, as many as the operator wants."""
 _BUDGETS = {"300 k": LIVE_BUDGET, "1 M": REVIEW_BUDGET, "3 M": FULL_BUDGET}
 _PANEL_PX = 252
 _PIXELS_NEAR = 6.0
@@ -44,7 +45,8 @@ class CloudPanel:
         self._drawn: tuple[Any, ...] = ()
         self._cloud: PointsPreview | None = None
         self._modes: dict[str, Mode] = {}
-        self._node: viser.PointCloudHandle | None = None
+        self._nodes: list[viser.PointCloudHandle] = []
+        """One per level of detail: each brings points between those of the ones before."""
         self._mesh: Any = None
         self._ground: Ground | None = None
         self._make_panel(client.gui)
@@ -60,10 +62,10 @@ class CloudPanel:
     @property
     def is_shown(self) -> bool:
         """True if there is a cloud."""
-        return self._node is not None
+        return bool(self._nodes)
 
     def draw(self, look: Look) -> None:
-        """Show the last cloud of this scan, first thinned, then in full."""
+        """Show the last cloud of this scan: coarse at once, then finer and finer up to the budget."""
         found = _last(look, "points")
         mesh = _last(look, "mesh")
         drawn = tuple((f[0].stage_run if f else None) for f in (found, mesh))
@@ -74,18 +76,13 @@ class CloudPanel:
         if found is None:
             self.clear()
             return
-        first = min(self._budget, LIVE_BUDGET)
-        self._fetch(found, first, is_new=True)
-        if self._cloud is not None and self._budget > first < self._cloud.total:
-            self._desk.load(
-                lambda: self._fetch(found, self._budget, is_new=False), key="cloud in full"
-            )
+        self._start(found)
 
     def clear(self) -> None:
         """Take the cloud away."""
-        if self._node is not None:
-            self._node.remove()
-        self._node, self._cloud, self._modes = None, None, {}
+        for node in self._nodes:
+            node.remove()
+        self._nodes, self._cloud, self._modes = [], None, {}
         self._panel.visible = False
 
     def forget(self) -> None:
@@ -147,19 +144,19 @@ class CloudPanel:
         look = self._desk.look
         found = _last(look, "points") if look else None
         if found is not None:
-            self._fetch(found, self._budget, is_new=False)
+            self._start(found, settle=False)
 
-    def _fetch(self, found: tuple[StageState, FieldView], budget: int, *, is_new: bool) -> None:
-        stage, field = found
-        look = self._desk.look
-        if stage.stage_run is None or look is None or look.scan.id != self._drawn[0]:
-            return  # the operator has gone on to another scan
-        cloud = self._desk.api.points(stage.stage_run, field.name, budget=budget)
+    def _start(self, found: tuple[StageState, FieldView], *, settle: bool = True) -> None:
+        """Show the coarsest level, and ask for the next ones behind whatever else is to be drawn."""
+        budget = min(FIRST_BUDGET, self._budget)
+        cloud = self._points(found, budget, beyond=0)
+        if cloud is None:
+            return
+        self.clear()
         if not len(cloud.points_mm):
-            self.clear()
             return
         self._cloud = cloud
-        if is_new or self._ground is None:
+        if settle or self._ground is None:
             self._settle(cloud)
         assert self._ground is not None, "set by _settle"
         self._modes = points_view.modes(cloud, self._ground)
@@ -167,7 +164,47 @@ class CloudPanel:
         if self._colour.value not in self._modes:
             self._colour.value = next(iter(self._modes))
         self._add_points(cloud)
-        self._explain(look)
+        self._refine(found, budget)
+
+    def _refine(self, found: tuple[StageState, FieldView], budget: int) -> None:
+        """Ask for the next level of detail if there is one."""
+        if (
+            self._cloud is None
+            or budget >= self._budget
+            or len(self._cloud.points_mm) >= self._cloud.total
+        ):
+            return
+        finer = next(
+            (b for b in (LIVE_BUDGET, REVIEW_BUDGET) if budget < b < self._budget), self._budget
+        )
+        self._desk.load(lambda: self._fetch_more(found, budget, finer), key="finer cloud")
+
+    def _fetch_more(self, found: tuple[StageState, FieldView], budget: int, finer: int) -> None:
+        if self._cloud is None or self._ground is None:
+            return
+        more = self._points(found, finer, beyond=budget)
+        if more is None or self._cloud is None:
+            return
+        if len(more.points_mm):
+            self._cloud = self._cloud.with_more(more)
+            modes = points_view.modes(self._cloud, self._ground)
+            self._modes = {
+                name: replace(mode, low=self._modes[name].low, high=self._modes[name].high)
+                for name, mode in modes.items()
+            }
+            self._add_points(more)
+        self._refine(found, finer)
+
+    def _points(
+        self, found: tuple[StageState, FieldView], budget: int, *, beyond: int
+    ) -> PointsPreview | None:
+        """Fetch points; None if the operator has gone on to another scan or result."""
+        stage, field = found
+        look = self._desk.look
+        shown = (look.scan.id if look else None, stage.stage_run)
+        if stage.stage_run is None or shown != self._drawn[:2]:
+            return None
+        return self._desk.api.points(stage.stage_run, field.name, budget=budget, beyond=beyond)
 
     def _settle(self, cloud: PointsPreview) -> None:
         """Turn the scene so that the table, if there is one, lies level."""
@@ -178,26 +215,40 @@ class CloudPanel:
         self._space.place(Placement.of(self._ground.up, placement.R[0], on_floor))
         self._space.view_part(*self.extent())
 
-    def _add_points(self, cloud: PointsPreview) -> None:
-        colours = points_view.colours(cloud, self._modes[self._colour.value])
-        size = float(np.clip(points_view.spacing_mm(cloud.points_mm) * 1.15, 0.05, 5.0)) * UNIT
-        # Single precision: viser's default of half is 0.5 mm off at 1 m.
-        self._node = self._space.scene.add_point_cloud(
-            f"{self._space.root}/cloud", cloud.points_mm * np.float32(UNIT), colours,
-            point_size=size, point_shape="square", precision="float32", point_shading="flat",
-        )  # fmt: skip
+    def _add_points(self, points: PointsPreview) -> None:
+        """Put points between those that are shown, and draw all as large as they are now apart."""
+        assert self._cloud is not None, "adds to a cloud"
+        start = len(self._cloud.points_mm) - len(points.points_mm)
+        mode = self._modes[self._colour.value]
+        colours = points_view.colours(points, _part(mode, slice(start, None)))
+        size = (
+            float(np.clip(points_view.spacing_mm(self._cloud.points_mm) * 1.15, 0.05, 5.0)) * UNIT
+        )
+        with self._client.atomic():
+            for node in self._nodes:
+                node.point_size = size
+            # Single precision: viser's default of half is 0.5 mm off at 1 m.
+            self._nodes.append(
+                self._space.scene.add_point_cloud(
+                    f"{self._space.root}/cloud {len(self._nodes)}", points.points_mm * np.float32(UNIT), colours,
+                    point_size=size, point_shape="square", precision="float32", point_shading="flat",
+                )
+            )  # fmt: skip
         self._panel.visible = True
+        look = self._desk.look
+        if look is not None:
+            self._explain(look)
 
     def _recolour(self) -> None:
-        look = self._desk.look
-        if (
-            self._cloud is None
-            or self._node is None
-            or self._colour.value not in self._modes
-            or look is None
-        ):
+        look, cloud = self._desk.look, self._cloud
+        if cloud is None or self._colour.value not in self._modes or look is None:
             return
-        self._node.colors = points_view.colours(self._cloud, self._modes[self._colour.value])
+        colours = points_view.colours(cloud, self._modes[self._colour.value])
+        start = 0
+        for node in self._nodes:
+            end = start + len(node.points)
+            node.colors = colours[start:end]
+            start = end
         self._explain(look)
 
     def _explain(self, look: Look) -> None:
@@ -257,6 +308,11 @@ class CloudPanel:
             f"{self._space.root}/mesh", corners.astype(np.float32) * np.float32(UNIT), triangles.astype(np.uint32),
             color=(150, 170, 200), side="double", flat_shading=False,
         )  # fmt: skip
+
+
+def _part(mode: Mode, chosen: slice) -> Mode:
+    """Return a mode for some of the points."""
+    return mode if mode.values is None else replace(mode, values=mode.values[chosen])
 
 
 def _last(look: Look, kind: str) -> tuple[StageState, FieldView] | None:

@@ -135,16 +135,19 @@ def points(
     field: Annotated[str, Path(min_length=1, max_length=100)],
     services: Uses,
     budget: Annotated[int, Query(ge=1000, le=20_000_000, description="Most points.")] = 300_000,
+    beyond: Annotated[
+        int, Query(ge=0, le=20_000_000, description="Leave out what this budget brings.")
+    ] = 0,
     scalar: Annotated[
         str | None, Query(max_length=100, description="Only this scalar; none: all.")
     ] = None,
 ) -> Response:
-    """Return a cloud thinned to the budget.
+    """Return a cloud thinned to the budget; a larger budget brings the same points and more between them.
 
     uint32 length of the header (little endian), header as JSON `{n, total, scalars: {name: {unit,
     title, low, high}}}`, float32 xyz (n, 3), uint8 rgb (n, 3) if it has colour, float32 (n) per scalar.
     """
-    cloud = services.cloud_preview(stage_run, field, budget=budget, scalar=scalar)
+    cloud = services.cloud_preview(stage_run, field, budget=budget, beyond=beyond, scalar=scalar)
     return Response(cloud, media_type="application/octet-stream", headers={"Cache-Control": A_DAY})
 
 

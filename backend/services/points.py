@@ -5,12 +5,11 @@ high}}}`, float32 xyz (n, 3), uint8 rgb (n, 3) if there is colour, then float32 
 """
 
 import json
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Integer
+from jaxtyping import Bool, Float32, Int8, Integer, UInt64
 
 from backend.domain.errors import InvalidSettingError, NotFoundError
 from backend.domain.hints import Points
@@ -20,6 +19,10 @@ from backend.storage.artifacts import ArtifactStore
 Array = np.ndarray[tuple[int, ...], np.dtype[Any]]
 
 _SAMPLE = 200_000
+_SCALES = 4
+"""Halvings of the distance between points, from every 16th row and column to every one."""
+_SHUFFLE, _LOW = np.uint64(2_654_435_761), np.uint64(2**32 - 1)
+"""An odd number mixes the order of 32 bits without bringing two together: within a level, chance decides."""
 
 
 def pack_points(
@@ -29,12 +32,14 @@ def pack_points(
     store: ArtifactStore,
     *,
     budget: int,
+    beyond: int = 0,
     scalar: str | None = None,
 ) -> bytes:
     """Thin a cloud to at most `budget` points and pack it.
 
-    Points that know their pixel (`pixel_x`, `pixel_y`) are thinned evenly over the picture: every k-th row and
-    column. Others are thinned by their order.
+    Points that know their pixel (`pixel_x`, `pixel_y`) are thinned evenly over the picture, others by chance
+    (always the same). A larger budget brings the points of every smaller one and more between them: so a cloud can be sent
+    coarse at first, and then what is `beyond`.
 
     Parameters
     ----------
@@ -45,7 +50,9 @@ def pack_points(
     store
         Where its arrays are.
     budget
-        Most points to send.
+        Most points to send, and as many come if there are.
+    beyond
+        Leave out the points that this budget brings.
     scalar
         Only this quantity; None: all.
 
@@ -66,7 +73,7 @@ def pack_points(
     if points is None:
         raise NotFoundError(f"This result has no {field}.")
     points = points.reshape(-1, 3)
-    chosen = _chosen(points, arrays["pixel_x"], arrays["pixel_y"], budget)
+    chosen = _chosen(points, arrays["pixel_x"], arrays["pixel_y"], budget, beyond)
     scalars = {
         name: values.reshape(-1)[chosen].astype("<f4")
         for name in hint.scalars
@@ -97,25 +104,41 @@ def _array(document: Mapping[str, Any], name: str, store: ArtifactStore) -> Arra
 
 
 def _chosen(
-    points: Float32[np.ndarray, "n 3"], x: Array | None, y: Array | None, budget: int
+    points: Float32[np.ndarray, "n 3"], x: Array | None, y: Array | None, budget: int, beyond: int
 ) -> Integer[np.ndarray, "m"]:
     """Return the indices of the points to send, finite ones only."""
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
-    if len(finite) <= budget:
+    if len(finite) <= budget and not beyond:
         return finite
+    rank = np.arange(len(finite), dtype=np.uint64) * _SHUFFLE & _LOW
     if x is not None and y is not None and len(x) == len(y) == len(points):
-        finite = finite[_on_grid(x[finite], y[finite], budget)]
-    if len(finite) <= budget:
-        return finite
-    return finite[np.arange(budget) * len(finite) // budget]
+        rank |= _levels(x[finite], y[finite]).astype(np.uint64) << np.uint64(32)
+    return np.asarray(finite[_first(rank, budget) & ~_first(rank, beyond)])
 
 
-def _on_grid(x: Array, y: Array, budget: int) -> Bool[np.ndarray, "n"]:
-    """Keep every k-th row and column, with the smallest k that brings the points near the budget."""
-    k = max(2, math.ceil(math.sqrt(len(x) / budget) - 0.1))
-    kept = (np.rint(x).astype(np.int64) % k == 0) & (np.rint(y).astype(np.int64) % k == 0)
-    # A cloud of one column has no second direction to be thinned in.
-    return kept if kept.sum() > budget / 8 else np.ones(len(x), dtype=bool)
+def _first(rank: UInt64[np.ndarray, "n"], count: int) -> Bool[np.ndarray, "n"]:
+    """Mark the `count` smallest; no two are equal."""
+    if count >= len(rank):
+        return np.ones(len(rank), np.bool_)
+    if count == 0:
+        return np.zeros(len(rank), np.bool_)
+    return np.asarray(rank <= np.partition(rank, count - 1)[count - 1], np.bool_)
+
+
+def _levels(x: Array, y: Array) -> Int8[np.ndarray, "n"]:
+    """Say at which level of detail a pixel appears: each level doubles the number of points.
+
+    Level 0 is every 16th row and column; from there on the middles of the squares come first, then those of
+    their sides.
+    """
+    column, row = (np.rint(v - v.min(initial=np.inf)).astype(np.int32) for v in (x, y))
+    level = np.zeros(len(x), np.int8)
+    for scale in range(_SCALES):
+        unit = 1 << (_SCALES - 1 - scale)
+        odd_column, odd_row = column & unit, row & unit
+        level[(odd_column & odd_row) != 0] = 2 * scale + 1
+        level[(odd_column ^ odd_row) != 0] = 2 * scale + 2
+    return level
 
 
 def _facts(hint: Any, name: str, values: Array) -> dict[str, Any]:

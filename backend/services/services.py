@@ -309,7 +309,13 @@ class Services:
         return levels_at(self.context, scan, stage, field, camera=camera, x=x, y=y)
 
     def cloud_preview(
-        self, stage_run: str, field: str, *, budget: int = 300_000, scalar: str | None = None
+        self,
+        stage_run: str,
+        field: str,
+        *,
+        budget: int = 300_000,
+        beyond: int = 0,
+        scalar: str | None = None,
     ) -> bytes:
         """Return a cloud thinned to at most `budget` points; see `points.pack_points`."""
         with self.context.database.reading() as repositories:
@@ -319,7 +325,13 @@ class Services:
             raise ConflictError(f"Stage run {stage_run} isn't finished: it has no points.")
         output = method.stage(run.stage).output
         return pack_points(
-            output, run.document, field, self.context.store, budget=budget, scalar=scalar
+            output,
+            run.document,
+            field,
+            self.context.store,
+            budget=budget,
+            beyond=beyond,
+            scalar=scalar,
         )
 
     # rigs

@@ -151,7 +151,13 @@ class FakeServices(Services):
         return whole
 
     def cloud_preview(
-        self, stage_run: str, field: str, *, budget: int = 300_000, scalar: str | None = None
+        self,
+        stage_run: str,
+        field: str,
+        *,
+        budget: int = 300_000,
+        beyond: int = 0,
+        scalar: str | None = None,
     ) -> bytes:
         return pack_points(self._run(stage_run)[1].result, budget)
 

@@ -1,5 +1,6 @@
 """Clouds made small enough for the screen."""
 
+import itertools
 import json
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -73,19 +74,42 @@ def test_the_budget_holds_and_isnt_wasted(
     total = width * height
     read = packed(cloud(width, height, pixels=pixels), store, budget)
     assert read.total == total
-    assert len(read.points_mm) <= budget
-    assert len(read.points_mm) >= min(total, budget) / 16
-    assert len(read.points_mm) == total or total > budget
+    assert len(read.points_mm) == min(total, budget)
 
 
 def test_thinning_keeps_every_kth_row_and_column(store: LocalArtifactStore) -> None:
-    read = packed(cloud(60, 40), store, 20 * 14)
+    read = packed(cloud(60, 40), store, 15 * 10)
     columns, rows = np.unique(read.points_mm[:, 0]), np.unique(read.points_mm[:, 1])
-    assert (np.diff(columns).tolist(), np.diff(rows).tolist()) == ([3.0] * 19, [3.0] * 13)
+    assert (np.diff(columns).tolist(), np.diff(rows).tolist()) == ([4.0] * 14, [4.0] * 9)
     assert read.colour is not None
     assert np.array_equal(read.colour[:, 0], read.points_mm[:, 0].astype(np.uint8)), (
         "colours follow their points"
     )
+
+
+@settings(
+    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    width=st.integers(1, 80),
+    height=st.integers(1, 80),
+    budgets=st.lists(st.integers(1, 7000), min_size=2, max_size=4, unique=True).map(sorted),
+    pixels=st.booleans(),
+)
+def test_a_cloud_comes_level_by_level(
+    store: LocalArtifactStore, width: int, height: int, budgets: list[int], pixels: bool
+) -> None:
+    """Coarse points and what is beyond them are, together, what the larger budget brings at once."""
+    whole = cloud(width, height, pixels=pixels)
+    read = packed(whole, store, budgets[0])
+    for smaller, larger in itertools.pairwise(budgets):
+        read = read.with_more(packed(whole, store, larger, beyond=smaller))
+    at_once = packed(whole, store, budgets[-1])
+    assert read.total == at_once.total
+    assert sorted(map(tuple, read.points_mm)) == sorted(map(tuple, at_once.points_mm))
+    assert np.array_equal(read.scalars[0].values, read.points_mm[:, 0] / np.float32(10))
+    assert read.colour is not None
+    assert np.array_equal(read.colour[:, 0], read.points_mm[:, 0].astype(np.uint8))
 
 
 def test_points_that_arent_finite_are_left_out(store: LocalArtifactStore) -> None:
