@@ -204,7 +204,7 @@ def _fill(view: _View, other: _View, camera_from_other: RigidTransform) -> None:
     view.points.depth_mm.reshape(-1)[splat.pixel] = splat.points_mm[:, 2]
     view.points.sigma_mm.reshape(-1)[splat.pixel] = other.points.sigma_mm[found][splat.source]
     view.reasons.reshape(-1)[splat.pixel] = 0
-    view.rows.append(FilterRow(f"filled in by {other.name}: -", -int(splat.pixel.size)))
+    view.rows.append(FilterRow(f"filled in from {other.name}", -int(splat.pixel.size)))
 
 
 def _filter(view: _View, params: DenseParams) -> None:
