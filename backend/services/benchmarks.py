@@ -27,6 +27,7 @@ from backend.numerics.matching import Matches, match
 from backend.numerics.rectification import Rectification, rectify
 from backend.numerics.sine_code import SineCode
 from backend.numerics.triangulation import triangulate_pair
+from backend.services.code_benchmark import FRAMES, CodeScene
 from backend.stages.cloud import Cloud
 from backend.stages.fringe_capture import fringe_frames
 from backend.stages.fringe_phase import FringePhaseParams, fringe_phase
@@ -114,6 +115,9 @@ def run_benchmark(
     tell(0.7, "whole chain")
     chain_ms = best_ms(scene.chain, rounds=max(2, rounds // 2))[0]
     peak_mb = _peak_mb(scene.chain)
+    tell(0.9, "Gray code")
+    code = CodeScene(*scene.size_px)
+    code_copy_ms, code_ms = best_ms(code.copy, code.decode, rounds=rounds)
     return BenchmarkReport(
         size=size,
         rounds=rounds,
@@ -122,6 +126,7 @@ def run_benchmark(
             Timing("decode 12 frames", decode_ms, decode_ms / copy_ms),
             Timing("match two cameras", match_ms, match_ms / copy_ms),
             Timing("triangulate", triangulate_ms, triangulate_ms / copy_ms),
+            Timing(f"decode {FRAMES} frames of Gray code", code_ms, code_ms / code_copy_ms),
         ),
         chain_s=chain_ms / 1000.0,
         points=scene.chain().point_count,
@@ -224,6 +229,12 @@ class _Scene:
             gray = np.roll(noise, number, axis=1) + _AMPLITUDE_GRAY * np.cos(phase)
             frames.append(np.round(gray).astype(np.uint8))
         return frames
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the cameras."""
+        height, width = self.pictures["left"][0].shape
+        return width, height
 
     def decode(self) -> object:
         """Decode one camera's frames to column, modulation, residual and reasons."""
