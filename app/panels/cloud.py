@@ -1,5 +1,8 @@
 """Cloud and mesh in the scene, and the small panel that says what their colours mean."""
 
+import asyncio
+import contextlib
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,6 +26,9 @@ FIRST_BUDGET, LIVE_BUDGET, REVIEW_BUDGET, FULL_BUDGET = 60_000, 300_000, 1_000_0
 """Points that come at once, and those that come after them, as many as the operator wants."""
 _BUDGETS = {"300 k": LIVE_BUDGET, "1 M": REVIEW_BUDGET, "3 M": FULL_BUDGET}
 _PANEL_PX = 252
+_STEADY_LEVELS = 2
+"""Levels of detail that are drawn while the viewer moves, too."""
+_AT_REST_S = 0.6
 _PIXELS_NEAR = 6.0
 
 
@@ -49,7 +55,10 @@ class CloudPanel:
         """One per level of detail: each brings points between those of the ones before."""
         self._mesh: Any = None
         self._ground: Ground | None = None
+        self._moved_s = 0.0
+        self._is_thin = False
         self._make_panel(client.gui)
+        client.camera.on_update(self._moved)
 
     def extent(self) -> tuple[Any, float]:
         """Return where the middle of the cloud is in the scene, and how far it reaches from there."""
@@ -122,6 +131,19 @@ class CloudPanel:
         return Picked(point, facts)
 
     # ---- inside
+
+    async def _moved(self, _: Any) -> None:
+        """While the viewer moves, draw fewer points: a browser without a graphics card takes long for all."""
+        self._moved_s = time.monotonic()
+        finest = self._nodes[_STEADY_LEVELS:]
+        if self._is_thin or not finest:
+            return
+        self._is_thin = True
+        _show(finest, visible=False)
+        while time.monotonic() - self._moved_s < _AT_REST_S:  # noqa: ASYNC110  nothing tells when the viewer rests
+            await asyncio.sleep(_AT_REST_S / 3)
+        self._is_thin = False
+        _show(self._nodes[_STEADY_LEVELS:], visible=True)
 
     def _make_panel(self, gui: viser.GuiApi) -> None:
         self._panel = gui.add_panel(visible=False)
@@ -308,6 +330,12 @@ class CloudPanel:
             f"{self._space.root}/mesh", corners.astype(np.float32) * np.float32(UNIT), triangles.astype(np.uint32),
             color=(150, 170, 200), side="double", flat_shading=False,
         )  # fmt: skip
+
+
+def _show(nodes: list[viser.PointCloudHandle], *, visible: bool) -> None:
+    for node in nodes:
+        with contextlib.suppress(RuntimeError):  # taken away meanwhile
+            node.visible = visible
 
 
 def _part(mode: Mode, chosen: slice) -> Mode:
