@@ -80,7 +80,9 @@ def test_all_exports_say_the_same(reflect, tmp_path):
     assert np.allclose(table["z_mm"], height[row, column], atol=1e-5)
     assert (out / "cloud.ply").read_bytes().startswith(b"ply")
     for name in ("modulation.png", "defects.png"):
-        assert cv2.imread(str(out / name), cv2.IMREAD_UNCHANGED).shape == SIZE[::-1]
+        picture = cv2.imread(str(out / name), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
+        assert picture.shape == SIZE[::-1]
     assert json.loads((out / "summary.json").read_text())["valid_share"] > 0.99
 
 

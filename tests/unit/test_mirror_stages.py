@@ -1,6 +1,7 @@
 """Stages of a reflection: what is shown, how it is read, what errors are counted against."""
 
 import io
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ FOCAL_MM = 900.0
 
 
 def linear(**changes):
-    values = {
+    values: dict[str, Any] = {
         "representation": "inverse", "reason": "", "steps": 8, "values": np.linspace(-1, 1, 256), "gray_low": 0.0,
         "gray_high": 255.0, "control_low": -0.5, "control_high": 0.8, "exposure_ms": 12.0,
     }  # fmt: skip
