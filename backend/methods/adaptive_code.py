@@ -44,6 +44,7 @@ METHOD = Method(
             "flat_mask.dilation_px": 5.0,
             "flat_mask.target": 0.99,
             "flat_mask.smoothing_px": 0.0,
+            "second_look.run": "no",
             **{
                 f"refine_{number}.{name}": value
                 for number in (1, 2, 3)

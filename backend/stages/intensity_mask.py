@@ -16,21 +16,21 @@ class MaskRound:
     """What one mask left unqualified: shares of the lit pixels, in all and by how bright a pixel responds."""
 
     mask: str
-    over_exposed: float
-    under_exposed: float
-    dark: float
+    over_exposed_share: float
+    under_exposed_share: float
+    dark_share: float
     """Unqualified among pixels that can take full light."""
-    middle: float
+    middle_share: float
     """Among those that need dimming, to a tenth at most."""
-    bright: float
+    bright_share: float
     """Among those that need more dimming than that."""
     frames: int
     """Pictures per camera that it took."""
 
     @property
-    def unqualified(self) -> float:
+    def unqualified_share(self) -> float:
         """Over- or under-exposed."""
-        return self.over_exposed + self.under_exposed
+        return self.over_exposed_share + self.under_exposed_share
 
 
 @dataclass(frozen=True)

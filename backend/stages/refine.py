@@ -191,7 +191,7 @@ class _Refinement:
         return replace(
             self.mask,
             factor=factor,
-            unqualified_share=row.unqualified,
+            unqualified_share=row.unqualified_share,
             rounds=(*self.mask.rounds, row),
             white=trial.white,
             unqualified=self._labels(trial, None),
@@ -359,7 +359,7 @@ class _Refinement:
         return IntensityMask(
             factor=factor,
             round=self.mask.round + 1,
-            unqualified_share=rounds[-1].unqualified,
+            unqualified_share=rounds[-1].unqualified_share,
             rounds=rounds,
             white=trial.white,
             unqualified=self._labels(trial, maps),

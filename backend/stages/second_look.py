@@ -76,8 +76,8 @@ class SecondLook:
         Picture("Light from other places", low=0.0, high=1.0, colormap="inferno"),
     ]
     """Share of each pixel's light that doesn't come along its own epipolar lines."""
-    before: Annotated[float, Value("Lit pixels untold or lit from two places")]
-    after: Annotated[float, Value("After the second look")]
+    before_share: Annotated[float, Value("Lit pixels untold or lit from two places")]
+    after_share: Annotated[float, Value("After the second look")]
     looks: Annotated[int, Value("Looks taken")] = 0
     codes: Codes | None = None
     """What the second look tells, where it was taken; None: it wasn't."""
@@ -87,10 +87,10 @@ class SecondLook:
 
 
 def _told(result: SecondLook, params: SecondLookParams) -> Check:
-    sentence = f"{result.before:.2%} of the lit pixels are untold or lit from two places"
+    sentence = f"{result.before_share:.2%} of the lit pixels are untold or lit from two places"
     if result.codes is not None:
-        sentence += f", {result.after:.2%} after a second look"
-    return Check("told", Level.OK, sentence, result.after, params.few)
+        sentence += f", {result.after_share:.2%} after a second look"
+    return Check("told", Level.OK, sentence, result.after_share, params.few)
 
 
 @stage(title="Second look", version=1, review=Review.ON_WARNING, checks=(_told,))

@@ -97,9 +97,9 @@ def test_one_refinement_serves_nearly_every_pixel_of_any_scene(options):
     found = masked(**options)
     before, after = found.mask.rounds
     assert before.mask == "no mask"
-    assert before.over_exposed > 0.3
-    assert after.over_exposed < 0.003
-    assert after.unqualified < 0.02
+    assert before.over_exposed_share > 0.3
+    assert after.over_exposed_share < 0.003
+    assert after.unqualified_share < 0.02
     assert found.mask.known_share > 0.98
     # What the mask is made of: where pixels look, but for those that second reflections outshine.
     off = np.stack([found.mask.projector_px["left"], found.mask.projector_row_px["left"]], -1)
@@ -187,7 +187,7 @@ def test_a_second_look_tells_what_second_reflections_had_spoilt():
         look = second_look(codes, frames, mask, base, facts, calibration, params, shoot)
     found = Masked(shoot, base, mask)
     assert look.looks == 6
-    assert look.after < 0.5 * look.before
+    assert look.after_share < 0.5 * look.before_share
     joined = joined_codes(codes, look)
     truth = found.truth
     shiny = truth.base & (truth.part == truth.part_names.index("shiny"))

@@ -257,7 +257,7 @@ def test_one_refinement_finds_where_pixels_look(gamma):
     assert mask.factor[23, 20] == 1
     assert mask.unqualified_share < 0.02
     assert [row.mask for row in mask.rounds] == ["no mask", "refinement 1"]
-    assert mask.rounds[0].unqualified > 0.4 > mask.rounds[1].unqualified
+    assert mask.rounds[0].unqualified_share > 0.4 > mask.rounds[1].unqualified_share
 
 
 def test_twelve_bits_are_refined_alike():
@@ -276,7 +276,7 @@ def test_a_wrong_first_mask_is_put_right():
     )
     mask = refined(rig, wrong, base, response)
     assert mask.rounds[0].mask == "first mask"
-    assert mask.unqualified_share < 0.02 < mask.rounds[0].unqualified
+    assert mask.unqualified_share < 0.02 < mask.rounds[0].unqualified_share
 
 
 def test_what_is_good_enough_is_left_alone():
@@ -346,7 +346,7 @@ def test_what_is_changed_by_hand_is_tried_but_not_refined():
     dimmer = refined(rig, once, base, response, run="no", scale=0.03)
     assert dimmer.round == 1
     assert dimmer.rounds[-1].mask == "by hand"
-    assert dimmer.rounds[-1].under_exposed > 0.3
+    assert dimmer.rounds[-1].under_exposed_share > 0.3
     assert not any(isinstance(shot.pattern, Gray) for shot in rig.shots)
 
 
