@@ -1,5 +1,6 @@
 """What a stage says about the quality of its own result."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +16,16 @@ class Check:
     level: Level
     sentence: str
     value: float | None = None
+    """None where there is nothing to measure; what isn't a finite number becomes None: JSON has none."""
     limit: float | None = None
     unit: str = ""
+
+    def __post_init__(self) -> None:
+        """Leave out numbers that can't be stored."""
+        for name in ("value", "limit"):
+            number = getattr(self, name)
+            if number is not None and not math.isfinite(number):
+                object.__setattr__(self, name, None)
 
 
 CheckFunction = Callable[[Any, Any], Check]
