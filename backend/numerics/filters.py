@@ -193,7 +193,9 @@ def without_specks(
     valid = valid_points(depth)
     if least_pixels <= 1 or not valid.any():
         return Kept(valid, 0)
-    middle_mm = float(np.median(depth[valid][::97]))
+    some = depth.ravel()[:: max(1, depth.size // 100_000)]
+    some = some[np.isfinite(some)]
+    middle_mm = float(np.median(some if some.size else depth[valid]))
     jump_mm = np.float32(steepest * pixel_angle_rad * middle_mm)
     label = np.empty(depth.size, np.int32)
     _label_runs(depth, jump_mm, label)
