@@ -48,8 +48,12 @@ def scan(
     scene: Scene = None,
     chain: Chain = None,
     method: Annotated[
-        str, typer.Option(help="Measuring method, see unglare methods.")
-    ] = "hdr-fringe",
+        str | None,
+        typer.Option(
+            help="Measuring method, see unglare methods.  [default: the one that the rig is made for, or hdr-fringe]",
+            show_default=False,
+        ),
+    ] = None,
     settings: Settings = None,
     given: Given = None,
     size: Size = None,
@@ -69,7 +73,7 @@ def scan(
 ) -> None:
     """Make a scan unattended: review gates pass on ok or warning, and stop on failure."""
     from backend.contract.requests import CreateScan
-    from backend.devices.loading import rig_for
+    from backend.devices.loading import method_for, rig_for
 
     quiet_logging()
     with answering(as_json) as answer, ProgressLines(hidden=quiet) as progress:
@@ -81,9 +85,11 @@ def scan(
             seed=seed,
             chain=chain,
         )
+        rig = rig or rig_for(options.get("scene"), method or "")
+        method = method or method_for(rig)
         request = CreateScan(
             method=method,
-            rig=rig or rig_for(options.get("scene"), method),
+            rig=rig,
             rig_options=options,
             name=name,
             preset=preset,

@@ -22,8 +22,6 @@ _Port = Annotated[
 ]
 
 DEMO_SCENE = "high-contrast"
-DEMO_METHOD = "hdr-fringe"
-"""Unless the scene's rig is made for others."""
 
 
 def register(application: typer.Typer) -> None:
@@ -62,7 +60,7 @@ def demo(
     from backend.settings import load_settings
 
     options = parse_rig_options(rig_options, scene=scene)
-    rig = rig_for(options["scene"], DEMO_METHOD)
+    rig = rig_for(options["scene"], "")
     settings = load_settings(host=host, port=port, data_folder=data, rig=rig, rig_options=options)
     main.serve(settings, prepare=lambda services: begin_first_scan(services, options, rig))
 
@@ -72,15 +70,15 @@ def begin_first_scan(services: "Services", options: dict[str, Any], rig: str = "
     import logging
 
     from backend.contract.requests import CreateScan, StartRun
-    from backend.devices.loading import options_schema
+    from backend.devices.loading import method_for
     from backend.domain.errors import UnglareError
 
     if services.scans(limit=1):
         return
     try:
-        method = options_schema(rig).get("methods", [DEMO_METHOD])[0]
         state = services.create_scan(
-            CreateScan(method=method, rig=rig, rig_options=options, name="First scan"), "demo"
+            CreateScan(method=method_for(rig), rig=rig, rig_options=options, name="First scan"),
+            "demo",
         )
         services.run(state.id, StartRun(), "demo")
     except UnglareError as error:

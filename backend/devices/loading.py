@@ -17,6 +17,7 @@ from backend.devices.protocols import Rig
 from backend.domain.errors import UnglareError
 
 GROUP = "unglare.rigs"
+DEFAULT_METHOD = "hdr-fringe"
 _BUILT_IN = {
     "simulated": "backend.devices.sim:create_rig",
     "sim-lcd": "backend.devices.sim:create_lcd_rig",
@@ -111,6 +112,18 @@ def rig_for(scene: str | None, method: str) -> str:
         if (pattern and re.search(pattern, scene)) if scene else made_for:
             return name
     return next(iter(_BUILT_IN))
+
+
+def method_for(rig: str) -> str:
+    """Return the method that a rig says it is made for first, else hdr-fringe; a rig file says nothing.
+
+    Examples
+    --------
+    >>> method_for("simulated"), method_for("sim-lcd")
+    ('hdr-fringe', 'fringe-reflection')
+    """
+    methods = options_schema(rig).get("methods") if rig in _BUILT_IN or rig in _entries() else None
+    return str(methods[0]) if methods else DEFAULT_METHOD
 
 
 def _factory(name: str) -> Callable[[Mapping[str, object]], Any]:

@@ -126,3 +126,16 @@ def test_options_may_be_text():
 )
 def test_scenes_and_methods_find_their_rig(scene, method, rig):
     assert loading.rig_for(scene, method) == rig
+
+
+@pytest.mark.parametrize(
+    ("rig", "method"),
+    [
+        ("simulated", "hdr-fringe"),
+        ("sim-lcd", "fringe-reflection"),
+        ("my-station", "hdr-fringe"),
+        ("somewhere.else:factory", "hdr-fringe"),
+    ],
+)
+def test_a_rig_says_which_method_it_is_made_for(rig, method):
+    assert loading.method_for(rig) == method
