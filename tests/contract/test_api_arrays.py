@@ -65,7 +65,16 @@ def picture(array: np.ndarray[Any, Any], suffix: str = ".png") -> bytes:
         ),
         (picture(np.full((2, 3), 255, np.uint8), ".tiff"), np.ones((2, 3), np.float32)),
     ],
-    ids=["npy", "transposed doubles", "painted in part", "booleans", "8 bit", "16 bit", "gray in colour", "tiff"],
+    ids=[
+        "npy",
+        "transposed doubles",
+        "painted in part",
+        "booleans",
+        "8 bit",
+        "16 bit",
+        "gray in colour",
+        "tiff",
+    ],
 )
 def test_a_mask_is_kept_as_factors(client: httpx.Client, body: bytes, expected: Any) -> None:
     answer = client.post("/api/artifacts", content=body)
