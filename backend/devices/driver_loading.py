@@ -74,9 +74,11 @@ def _factory(group: str, name: str, driver: str) -> Callable[..., Any]:
     try:
         if place is not None:
             module, _, attribute = place.partition(":")
-            return getattr(importlib.import_module(module), attribute)  # type: ignore[no-any-return]
+            built_in: Callable[..., Any] = getattr(importlib.import_module(module), attribute)
+            return built_in
         if entry is not None:
-            return entry.load()  # type: ignore[no-any-return]
+            from_package: Callable[..., Any] = entry.load()
+            return from_package
     except Exception as error:
         raise RigConfigError(
             f"{name}: driver {driver} can't be loaded ({type(error).__name__}: {error}); check that its package is installed"

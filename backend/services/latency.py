@@ -35,6 +35,27 @@ _STEADY_S = 0.6
 
 
 @runtime_checkable
+class Clock(Protocol):
+    """Time, and waiting for it."""
+
+    def now_s(self) -> float:
+        """Return the time; only differences mean something."""
+        ...
+
+    def sleep(self, duration_s: float) -> None:
+        """Wait."""
+        ...
+
+
+class _RealTime:
+    def now_s(self) -> float:
+        return time.monotonic()
+
+    def sleep(self, duration_s: float) -> None:
+        time.sleep(duration_s)
+
+
+@runtime_checkable
 class Flashing(Protocol):
     """What is asked of a projector here; every `Projector` can do it."""
 
@@ -140,17 +161,23 @@ def measure_latency(
 
 
 def latency_of(
-    projector: Flashing, cameras: Sequence[Taking], progress: Progress, *, repetitions: int
+    projector: Flashing,
+    cameras: Sequence[Taking],
+    progress: Progress,
+    *,
+    repetitions: int,
+    clock: Clock | None = None,
 ) -> Latency:
     """Measure the latency of an opened projector by opened cameras that see its light."""
-    return _Bench(projector, cameras).measure(repetitions, progress)
+    return _Bench(projector, cameras, clock or _RealTime()).measure(repetitions, progress)
 
 
 class _Bench:
     """Projector and cameras while the latency is measured."""
 
-    def __init__(self, projector: Flashing, cameras: Sequence[Taking]) -> None:
+    def __init__(self, projector: Flashing, cameras: Sequence[Taking], clock: Clock) -> None:
         self._projector = projector
+        self._clock = clock
         self._cameras = tuple(cameras)
         refresh_hz = projector.capabilities.refresh_hz or 60.0
         self._period_ms = 1000.0 / refresh_hz
@@ -192,8 +219,8 @@ class _Bench:
     def _pictures(self, level: int, delay_s: float) -> list[Gray]:
         """Show a level, wait from its acknowledgement on, and take one picture with each camera."""
         self._projector.blank(level)
-        acknowledged_s = time.monotonic()
-        time.sleep(max(0.0, delay_s - (time.monotonic() - acknowledged_s)))
+        acknowledged_s = self._clock.now_s()
+        self._clock.sleep(max(0.0, delay_s - (self._clock.now_s() - acknowledged_s)))
         for camera in self._cameras:
             camera.trigger()
         return [_gray(camera) for camera in self._cameras]
@@ -240,7 +267,7 @@ class _Bench:
     ) -> list[float]:
         start = 255 - target
         self._projector.blank(start)
-        time.sleep(_STEADY_S)
+        self._clock.sleep(_STEADY_S)
         pictures = self._pictures(target, delay_ms / 1000.0)
         return [
             share_of_change(gray, before, after, self._lit(dark, bright))

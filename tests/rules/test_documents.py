@@ -73,9 +73,17 @@ def test_commands_and_options_exist(root: Path, document: str, commands: Mapping
     for words in shell_lines(text):
         if words[0] != "unglare" or words[1] == "COMMAND":
             continue
-        assert words[1] in commands, words
-        options = {option for p in commands[words[1]].params for option in p.opts}
+        command = meant(commands, words[1:])
+        assert command is not None, words
+        options = {option for p in command.params for option in p.opts}
         assert {w for w in words[2:] if w.startswith("--")} - options == set(), words
+
+
+def meant(commands: Mapping[str, Any], words: list[str]) -> Any:
+    """Return the command that words name, also one of a group."""
+    command = commands.get(words[0])
+    group = getattr(command, "commands", None)
+    return meant(group, words[1:]) if group and len(words) > 1 else command
 
 
 def test_every_command_is_shown(readme: str, commands: Mapping[str, Any]) -> None:
