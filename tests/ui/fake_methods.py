@@ -506,11 +506,11 @@ MASKED = (
 )
 
 METHODS = {
-    "painted": ("Painted mask", "Levels, and a mask that is painted on.", MASKED),
     "hdr-fringe": (
         "Multi-exposure phase shifting",
         "Fringes at several exposures, two cameras.",
         FRINGE,
     ),
     "odd-one": (f"Odd {EVIL}", "Every kind of view.", ODD),
+    "painted": ("Painted mask", "Levels, and a mask that is painted on.", MASKED),
 }
