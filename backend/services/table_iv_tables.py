@@ -44,7 +44,7 @@ def points_table(reference: Measured, results: Sequence[Measured]) -> ReportTabl
 def detail_table(reference: Measured, everything: Sequence[Measured]) -> ReportTable:
     """Write the figures of every measurement with the usual decoding, part by part."""
     columns: tuple[Column, ...] = (
-        Column("variant", "measurement"),
+        Column("variant", "frames"),
         Column("exposure_ms", "ms", ".0f"),
         Column("refinements", "rounds", "d"),
         Column("part", "part"),
@@ -52,7 +52,7 @@ def detail_table(reference: Measured, everything: Sequence[Measured]) -> ReportT
         Column("of_sprayed", "of sprayed", ".2%"),
         Column("completeness", "of truth", ".2%"),
         Column("outlier_share", "outliers", ".3%"),
-        Column("over_exposed_share", "over-exposed", ".2%"),
+        Column("over_exposed_share", "over-exp.", ".2%"),
         Column("mean_mm", "mean mm", ".4f"),
         Column("std_mm", "std mm", ".4f"),
         Column("rms_mm", "rms mm", ".4f"),

@@ -45,3 +45,26 @@ def test_a_rig_without_calibration_has_no_table_i(unglare):
     done = unglare("report", "table-i", "--rig-option", "calibrated=false", "--json", "--quiet")
     assert done["status"] == 1
     assert "calibrate it" in done["answer"]["error"]
+
+
+def test_table_iv_compares_mask_no_mask_and_spray(unglare, tmp_path):
+    sizes = ("--size", "320x240", "--projector-size", "256x192")
+    done = unglare("report", "table-iv", *sizes, "--out", tmp_path / "out", "--json", "--quiet")
+    assert done["status"] == 0, done["err"]
+    tables = done["answer"]["tables"]
+    rows = {row["part"]: row for row in tables["table_iv"]["rows"]}
+    assert set(rows) == {"all", "table", "black", "dark", "shiny"}
+    assert all(row["sprayed"] > 0 for row in rows.values())
+    assert rows["all"]["mask_share"] > rows["all"]["no_mask_high_share"]
+    measurements = tables["measurements"]["rows"]
+    assert {row["variant"] for row in measurements} == {
+        "sprayed",
+        "no_mask_middle",
+        "no_mask_high",
+        "mask",
+    }
+    assert all(row["error"] is None for row in measurements)
+    decoded = {(row["variant"], row["part"]): row for row in tables["decoding"]["rows"]}
+    assert decoded["no_mask_middle", "black"]["fixed_completeness"] < 0.5
+    assert (tmp_path / "out/table_iv.csv").read_text().startswith("part,sprayed,no_mask_middle")
+    assert (tmp_path / "out/table_iv.png").is_file()
