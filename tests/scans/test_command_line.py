@@ -255,7 +255,14 @@ def test_a_healthy_rig_has_no_problems(unglare):
 )
 def test_a_rigs_problem_is_named(unglare, option, words):
     done = unglare(
-        "rigs", "check", *SMALL, "--rig-option", option, "--rig-option", "fail_for_good=true", "--json"
+        "rigs",
+        "check",
+        *SMALL,
+        "--rig-option",
+        option,
+        "--rig-option",
+        "fail_for_good=true",
+        "--json",
     )
     assert done.status == 1
     assert words in done.answer["error"]
