@@ -115,9 +115,11 @@ def _factor(
 def _edges(code: CodeSet, located: LineShift, stripes: Stripes, size_px: int) -> EdgePositions:
     """Place the edges along rows for columns, along columns for rows."""
     assert code.stripes is not None, "only sets with stripes come here"
-    pictures = [[f.gray for f in group] for group in (code.stripes.patterns, code.stripes.inverses)]
+    patterns = [f.gray for f in code.stripes.patterns]
+    inverses = [f.gray for f in code.stripes.inverses]
     place = located.projector_px
     if code.axis == "y":
-        pictures = [[np.ascontiguousarray(p.T) for p in group] for group in pictures]
+        patterns = [np.ascontiguousarray(p.T) for p in patterns]
+        inverses = [np.ascontiguousarray(p.T) for p in inverses]
         place = np.ascontiguousarray(place.T)
-    return edge_positions(*pictures, stripes, place, size_px=size_px)
+    return edge_positions(patterns, inverses, stripes, place, size_px=size_px)
