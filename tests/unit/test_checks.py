@@ -18,9 +18,12 @@ def test_a_value_that_is_no_number_is_left_out(value):
 
 
 def test_values_are_graded_from_both_sides():
-    limits = {"warning": 0.5, "failure": 0.1, "sentence": "a sentence"}
-    grades = [at_least("share", v, **limits).level for v in (0.9, 0.3, 0.05)]
+    good, middling, bad = (
+        at_least("share", v, warning=0.5, failure=0.1, sentence="a sentence")
+        for v in (0.9, 0.3, 0.05)
+    )
+    grades = [good.level, middling.level, bad.level]
     assert grades == [Level.OK, Level.WARNING, Level.FAILURE]
-    checks = tuple(at_least("share", v, **limits) for v in (0.9, 0.3))
+    checks = (good, middling)
     assert worst(checks) is Level.WARNING
     assert worst(()) is Level.OK

@@ -28,7 +28,8 @@ def test_it_is_found_among_wrong_codes_and_noise():
 def test_the_same_points_give_the_same_matrix():
     camera = points()
     projector = np.rint(map_points(TRUE, camera))
-    assert np.array_equal(*(fit_homography(camera, projector).matrix for _ in range(2)))
+    first, second = (fit_homography(camera, projector).matrix for _ in range(2))
+    assert np.array_equal(first, second)
 
 
 @pytest.mark.parametrize(
