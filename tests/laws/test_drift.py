@@ -14,7 +14,8 @@ def surface(height: int, width: int) -> np.ndarray:
 def drift_of(deviation: np.ndarray) -> np.ndarray:
     left = deviation.copy()
     take_off_drift(left)
-    return deviation - left
+    drift: np.ndarray = deviation - left
+    return drift
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.5])

@@ -15,6 +15,7 @@ from backend.domain.rig import (
     RigCalibration,
     RigFacts,
 )
+from backend.domain.shots import Shot
 from backend.stages.band_capture import BandCaptureParams, band_capture, doubtful_pixels, lines
 from backend.stages.band_phase import BandPhaseParams, band_phase
 from backend.stages.cloud import Cloud
@@ -107,7 +108,7 @@ class TwoPaths:
     """Shows every pixel its own column, and on top a second one of another line, where that is lit, too."""
 
     def __init__(self) -> None:
-        self.shots = []
+        self.shots: list[Shot] = []
         own = lines(calibration(), "left")
         height, _ = own.projector_px.shape
         self.column = np.full((HEIGHT, WIDTH), 70.3)

@@ -48,7 +48,7 @@ def test_a_camera_above_the_projector_is_refused():
 
 def test_any_two_bands_are_lit_apart_by_some_bit_and_borders_by_one_only():
     bands = Bands(-100.0, 25.0, 4)
-    middles = np.float32(-100 + 25 * (np.arange(16) + 0.5))
+    middles = (-100 + 25 * (np.arange(16) + 0.5)).astype(np.float32)
     lit = np.array([bands.lit(middles, bit, inverse=False) for bit in range(4)])
     assert len({tuple(column) for column in lit.T}) == 16
     assert (np.abs(np.diff(lit.astype(int), axis=1)).sum(axis=0) == 1).all()
@@ -59,7 +59,7 @@ def test_any_two_bands_are_lit_apart_by_some_bit_and_borders_by_one_only():
 
 def test_a_margin_leaves_out_what_is_near_a_border():
     bands = Bands(0.0, 10.0, 1)
-    lines = np.float32([8.0, 9.5, 10.5, 12.0, np.nan])
+    lines = np.array([8.0, 9.5, 10.5, 12.0, np.nan], np.float32)
     well = bands.well_lit(lines, 0, inverse=False, margin_px=1.0)
     assert well[:4].tolist() == [False, False, False, True]
 
