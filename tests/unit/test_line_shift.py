@@ -36,12 +36,12 @@ def coarse(u_px, width=4):
 def pictures(
     u_px, *, gain=150.0, offset=10.0, blur=0.82, noise=0.0, mask=None, second=None, dtype=np.uint8,
     stripes=STRIPES, top=255,
-):  # fmt: skip
+) -> tuple[list[np.ndarray], list[np.ndarray]]:  # fmt: skip
     """Pattern and inverse at every shift; `second` = (share, distance in px) of a second reflection."""
     rng = np.random.default_rng(1)
     columns = np.arange(-40, WIDTH_PX + 40)
     light = np.ones(columns.size) if mask is None else np.pad(mask, 40, mode="edge")
-    frames: list[list[np.ndarray]] = [[], []]
+    frames: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for shift in range(stripes.shifts):
         phase = (columns - stripes.first_edge_px - shift * stripes.step_px) % stripes.period_px
         for inverse in (0, 1):
@@ -69,10 +69,12 @@ def projected(pattern, u_px, blur):
 
 
 def decode(frames, u_px, *, noise=0.0, stripes=STRIPES, **settings):
+    patterns, inverses = frames
     arguments: dict[str, Any] = {"limits": LIMITS, **settings}
     return decode_line_shift(
-        *frames, stripes, coarse(u_px), size_px=WIDTH_PX, noise=NoiseModel(noise, 0.0), **arguments
-    )
+        patterns, inverses, stripes, coarse(u_px), size_px=WIDTH_PX,
+        noise=NoiseModel(noise, 0.0), **arguments,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("blur", [0.7, 0.82, 1.3])
@@ -143,13 +145,13 @@ def test_light_from_elsewhere_that_pattern_and_inverse_share_does_not_matter():
 def test_a_second_reflection_is_taken_off(away):
     u_px = np.tile(np.linspace(20, 200, 250), (40, 1))
     plain, mixed = pictures(u_px, noise=0.8), pictures(u_px, second=(0.4, away), noise=0.8)
-    frames = [
+    patterns, inverses = (
         [np.vstack([p, m[:9]]) for p, m in zip(*pair, strict=True)]
         for pair in zip(plain, mixed, strict=True)
-    ]
+    )
     u_px = np.vstack([u_px, u_px[:9]])
-    located = decode(frames, u_px, noise=0.8)
-    found = separate_lights(*frames, STRIPES, located, noise=NoiseModel(0.8, 0.0))
+    located = decode((patterns, inverses), u_px, noise=0.8)
+    found = separate_lights(patterns, inverses, STRIPES, located, noise=NoiseModel(0.8, 0.0))
     before = np.nanmedian(np.abs(located.projector_px - u_px)[41:])
     after = np.nanmedian(np.abs(found.projector_px - u_px)[41:])
     assert before > 0.15
