@@ -73,6 +73,7 @@ def test_the_plan_is_one_burst_under_the_mask_for_the_cameras_asked_for():
     mask = IntensityMask(np.full((768, 1024), 0.5, np.float32))
     plan = capture_plan(patterns(), 25.0, 3.0, mask, ("left",))
     burst = next(plan)
+    assert isinstance(burst, tuple)
     assert len(burst) == 50
     assert {(s.exposure_ms, s.gain_db, s.cameras, s.role) for s in burst} == {
         (25.0, 3.0, ("left",), "code")
@@ -90,15 +91,20 @@ def frames_of(found):
     return tuple(Frame("left", pattern, 20.0, picture) for pattern in found)
 
 
+def stripe_of(frame: Frame) -> Stripe:
+    assert isinstance(frame.pattern, Stripe)
+    return frame.pattern
+
+
 def test_captured_stripes_are_sorted_by_position():
     found = frames_of(patterns())
     columns, rows = code_sets(tuple(reversed(found)))
     assert rows.stripes is None
     assert columns.stripes is not None
     assert columns.stripes.stripes(1024) == Stripes(0.0, 1.0, 8)
-    shifts = [f.pattern.shift_periods for f in columns.stripes.patterns]
+    shifts = [stripe_of(f).shift_periods for f in columns.stripes.patterns]
     assert shifts == sorted(shifts)
-    assert all(f.pattern.inverse for f in columns.stripes.inverses)
+    assert all(stripe_of(f).inverse for f in columns.stripes.inverses)
 
 
 def test_stripes_half_a_period_on_are_inverses():
