@@ -25,6 +25,7 @@ from backend.devices.peers.gige_camera import GigECamera, Wire
 from backend.devices.peers.gvcp import ask
 from backend.devices.protocols import LinkState, TriggerSource
 from backend.devices.sim import create_rig
+from backend.devices.sim.rig import SimulatedRig
 
 try:
     aravis()
@@ -46,7 +47,7 @@ def addresses(worker_id: str) -> tuple[str, str]:
 @contextmanager
 def network(
     addresses: tuple[str, str], wire: Wire | None = None, **options: object
-) -> Iterator[tuple[object, list[GigECamera]]]:
+) -> Iterator[tuple[SimulatedRig, list[GigECamera]]]:
     """Serve the cameras of a simulated rig."""
     simulated = create_rig({**SCENE, **options})
     with simulated, ExitStack() as stack:

@@ -64,4 +64,4 @@ class TestScreenAndFilmCamera(_SimulatedLcd):
 
     def light(self, share: np.ndarray) -> np.ndarray:
         levels = np.linspace(0.0, 1.0, 4096)
-        return np.interp(share, CHAINS["D"].tone(levels), levels)
+        return np.asarray(np.interp(share, CHAINS["D"].tone(levels), levels))

@@ -345,10 +345,10 @@ def test_a_measured_screen_can_be_a_file(tmp_path, opened):
 
 def test_truth_of_points_and_truth_of_the_mirror_agree(opened):
     rig = opened(scene="mirror-dent")
+    pose = rig.calibration().mirror_from_world
     assert isinstance(rig, KnowsTruth)
     assert isinstance(rig, KnowsMirrorTruth)
     points, exact = rig.truth("camera"), rig.mirror_truth("camera")
-    pose = rig.calibration().mirror_from_world
     in_mirror = points.points_mm[exact.seen] @ pose.R.T + pose.t_mm
     np.testing.assert_allclose(in_mirror, exact.points_mm[exact.seen], atol=2e-4)
     np.testing.assert_array_equal(points.lit_and_seen, exact.seen)
