@@ -1,5 +1,6 @@
 """The final code on the simulated rig: predicted noise, two cameras, stripe widths with and without a mask."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 
@@ -37,7 +38,9 @@ def codes_of(shoot: SimShoot, mask=None, exposure_ms=None, **settings) -> Codes:
     facts = shoot.rig.facts()
     base = base_exposure(facts, BaseExposureParams(exposure_ms=exposure_ms), shoot)
     frames = code_capture(mask, base, facts, CodeCaptureParams(), shoot)
-    return edges(frames, mask, facts, EdgesParams(**settings), silent)
+    codes = edges(frames, mask, facts, EdgesParams(**settings), silent)
+    assert isinstance(codes, Codes)
+    return codes
 
 
 @lru_cache(maxsize=1)
@@ -47,7 +50,9 @@ def plane() -> tuple[Codes, SimShoot]:
 
 
 def cloud_of(codes: Codes, shoot: SimShoot, **settings) -> Cloud:
-    return code_cloud(codes, shoot.rig.calibration(), CodeCloudParams(**settings), silent)
+    cloud = code_cloud(codes, shoot.rig.calibration(), CodeCloudParams(**settings), silent)
+    assert isinstance(cloud, Cloud)
+    return cloud
 
 
 def scores_of(cloud: Cloud, shoot: SimShoot):
@@ -86,14 +91,19 @@ def test_the_second_camera_fills_what_the_first_cannot_read():
     hole = np.s_[150:190, 200:260]
     for maps in (codes.projector_px, codes.sigma_px, codes.projector_row_px):
         assert np.isfinite(maps["left"][hole]).all()
-    blind = {
-        name: dict(getattr(codes, name))
-        for name in ("projector_px", "sigma_px", "projector_row_px", "reasons")
-    }
-    for name, maps in blind.items():
-        maps["left"] = maps["left"].copy()
-        maps["left"][hole] = Reason.SATURATED if name == "reasons" else np.nan
-    holed = replace(codes, **blind)
+
+    def blind(maps: Mapping[str, np.ndarray], value: float) -> dict[str, np.ndarray]:
+        left = maps["left"].copy()
+        left[hole] = value
+        return {**maps, "left": left}
+
+    holed = replace(
+        codes,
+        projector_px=blind(codes.projector_px, np.nan),
+        sigma_px=blind(codes.sigma_px, np.nan),
+        projector_row_px=blind(codes.projector_row_px, np.nan),
+        reasons=blind(codes.reasons, Reason.SATURATED),
+    )
     one, two = (cloud_of(holed, shoot, cameras=cameras) for cameras in ("reference", "all"))
     assert np.isnan(one.depth_mm["left"][hole]).all()
     filled = two.depth_mm["left"][hole]
