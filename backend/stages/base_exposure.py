@@ -16,6 +16,7 @@ from backend.domain.rig import CameraFacts, RigFacts
 from backend.domain.shots import Exposed, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Review
+from backend.stages.camera_noise import noise_model
 from backend.stages.pre_exposure import ExposureGrid
 
 _STRIPE_PX = 16
@@ -230,11 +231,8 @@ def _pair_noise_gray(
     gray: Integer[np.ndarray, "h w"], facts: CameraFacts
 ) -> Float32[np.ndarray, "h w"]:
     """Return the noise of a difference of two pictures: read noise, shot noise, rounding."""
-    electrons_per_gray = facts.full_well_e / facts.full_scale_gray
-    signal_gray = np.maximum(gray - np.float32(facts.black_level_gray), np.float32(0))
-    read = (facts.read_noise_e / electrons_per_gray) ** 2 + 1 / 12
-    variance = np.float32(read) + signal_gray / np.float32(electrons_per_gray)
-    return np.sqrt(np.float32(2) * variance)
+    sigma_gray = noise_model(facts).sigma_gray(gray.astype(np.float32))
+    return np.asarray(np.sqrt(np.float32(2)) * sigma_gray, np.float32)
 
 
 def _black_limit_ms(

@@ -21,6 +21,7 @@ from backend.numerics.code_certainty import (
 from backend.numerics.edges import decode_bridged_gray_code
 from backend.numerics.gray_code import decode_gray_code
 from backend.numerics.reasons import Reason
+from backend.stages.camera_noise import noise_model
 from backend.stages.pre_exposure import ExposureGrid
 
 _UNJUDGED_BITS = 1
@@ -114,9 +115,7 @@ def shorter_ms(exposure_ms: float, times: float, facts: RigFacts) -> float:
 
 def least_contrast_gray(camera: CameraFacts) -> float:
     """Return the difference of two dark pictures that noise alone doesn't reach: five standard deviations."""
-    gray_per_electron = camera.full_scale_gray / camera.full_well_e
-    sigma = np.sqrt((camera.read_noise_e * gray_per_electron) ** 2 + 1 / 12)
-    return float(5 * np.sqrt(2) * sigma)
+    return float(5 * np.sqrt(2 * noise_model(camera).dark_variance_gray2))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from backend.numerics.screen_phase import (
 from backend.numerics.screen_ramp import control_of_gray
 from backend.numerics.sine_code import step_fit
 from backend.numerics.surface_maps import against_surroundings, smoothed
-from backend.numerics.uncertainty import NoiseModel
+from backend.stages.camera_noise import noise_model
 from backend.stages.cloud import REASON_LABELS
 from backend.stages.fringe_checks import (
     Chosen,
@@ -522,14 +522,7 @@ def _sigma_mrad(
     facts: RigFacts,
 ) -> Float32[np.ndarray, "h w"]:
     """Predict the noise of the finest phase from the camera's and the fringes' modulation."""
-    of_camera = facts.cameras[camera]
-    noise = NoiseModel.of_camera(
-        read_noise_e=of_camera.read_noise_e,
-        full_well_e=of_camera.full_well_e,
-        full_scale_gray=of_camera.full_scale_gray,
-        black_gray=of_camera.black_level_gray,
-        gain_db=one.frames[0].gain_db,
-    )
+    noise = noise_model(facts.cameras[camera], gain_db=one.frames[0].gain_db)
     found = positions[one.axis]
     gain = np.float32(1e3 * np.sqrt(one.code.noise_gains[-1]))
     sigma_gray = noise.sigma_gray(found.mean_gray).astype(np.float32)

@@ -11,8 +11,8 @@ from backend.numerics.edge_positions import EdgePositions, edge_positions
 from backend.numerics.line_shift import LineShift, LineShiftLimits, Stripes, decode_line_shift
 from backend.numerics.mixed_light import separate_lights
 from backend.numerics.reasons import Reason
-from backend.numerics.uncertainty import NoiseModel
-from backend.stages.code_frames import CodeSet, StripeSet
+from backend.stages.camera_noise import noise_model
+from backend.stages.code_frames import CodeSet
 from backend.stages.intensity_mask import IntensityMask
 
 _SPARE_PX = 1.5
@@ -51,7 +51,7 @@ def shifted_edges(
     patterns = [f.gray for f in code.stripes.patterns]
     inverses = [f.gray for f in code.stripes.inverses]
     factor = None if mask is None else _factor(mask, code.axis, projector)
-    noise = _noise(camera, code.stripes)
+    noise = noise_model(camera, gain_db=code.stripes.patterns[0].gain_db)
     located = decode_line_shift(
         patterns,
         inverses,
@@ -88,16 +88,6 @@ def _coarse_error_px(coarse_width_px: float, stripes: Stripes) -> float:
             f"{stripes.period_px:g} px: capture finer bits or wider stripes."
         )
     return error_px
-
-
-def _noise(camera: CameraFacts, stripes: StripeSet) -> NoiseModel:
-    return NoiseModel.of_camera(
-        read_noise_e=camera.read_noise_e,
-        full_well_e=camera.full_well_e,
-        full_scale_gray=camera.full_scale_gray,
-        black_gray=camera.black_level_gray,
-        gain_db=stripes.patterns[0].gain_db,
-    )
 
 
 def _factor(
