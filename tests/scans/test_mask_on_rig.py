@@ -51,7 +51,9 @@ class Masked(NamedTuple):
 
     @property
     def calibration(self) -> RigCalibration:
-        return self.shoot.rig.calibration()
+        calibration = self.shoot.rig.calibration()
+        assert isinstance(calibration, RigCalibration)
+        return calibration
 
     @property
     def truth(self):

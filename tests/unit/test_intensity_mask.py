@@ -17,7 +17,15 @@ from backend.numerics.unqualified import (
     judge_pixels,
 )
 
-NAN = np.float32(np.nan)
+NAN = float("nan")
+
+
+def gray(rows: list[list[int]]) -> np.ndarray:
+    return np.array(rows, np.uint8)
+
+
+def f32(rows: list[list[float]]) -> np.ndarray:
+    return np.array(rows, np.float32)
 
 
 @given(gain=st.floats(0.01, 30), offset=st.floats(0, 30))
@@ -43,8 +51,8 @@ def test_a_pixel_that_returns_nothing_may_have_all_the_light():
 
 def test_of_several_pixels_at_one_place_the_dazzled_one_decides():
     into = np.ones((2, 3), np.float32)
-    values = np.float32([[0.5, 0.2, 0.7, NAN]])
-    columns = np.float32([[1.4, 0.6, 2.0, 0.0]])
+    values = f32([[0.5, 0.2, 0.7, NAN]])
+    columns = f32([[1.4, 0.6, 2.0, 0.0]])
     scatter(values, columns, np.zeros_like(columns), into=into)
     assert into[0].tolist() == pytest.approx([1, 0.2, 0.7])
     assert into[1].tolist() == [1, 1, 1]
@@ -52,7 +60,7 @@ def test_of_several_pixels_at_one_place_the_dazzled_one_decides():
 
 def test_places_outside_the_projector_are_left_out():
     into = np.ones((1, 2), np.float32)
-    columns = np.float32([[-1, 2, NAN, np.inf]])
+    columns = f32([[-1, 2, NAN, np.inf]])
     scatter(np.zeros_like(columns), columns, np.zeros_like(columns), into=into)
     assert into.tolist() == [[1, 1]]
 
@@ -79,8 +87,8 @@ def test_smoothing_takes_roughness_and_leaves_steps():
 
 
 def test_the_light_at_a_place_is_interpolated_and_unknown_where_the_place_is():
-    factor = np.float32([[0, 1], [0, 1]])
-    seen = light_at(factor, np.float32([[0.25, NAN]]), np.float32([[0.5, 0.0]]))
+    factor = f32([[0, 1], [0, 1]])
+    seen = light_at(factor, f32([[0.25, NAN]]), f32([[0.5, 0.0]]))
     assert seen[0, 0] == pytest.approx(0.25, abs=0.02)
     assert np.isnan(seen[0, 1])
 
@@ -95,22 +103,22 @@ def test_a_lone_code_is_no_neighbour_of_anyone():
 
 
 def test_runs_are_filled_between_ends_of_one_surface_only():
-    row = np.float32([[1, NAN, NAN, 4, NAN, 90, NAN, NAN, NAN, 94, NAN]])
+    row = f32([[1, NAN, NAN, 4, NAN, 90, NAN, NAN, NAN, 94, NAN]])
     filled = fill_runs(row, np.isnan(row), longest_px=2)
     assert filled[0, :4].tolist() == [1, 2, 3, 4]
     assert np.isnan(filled[0, [4, 6, 7, 8, 10]]).all()
 
 
 def test_only_what_may_be_filled_is():
-    row = np.float32([[1, NAN, NAN, 4]])
+    row = f32([[1, NAN, NAN, 4]])
     filled = fill_runs(row, np.array([[False, True, False, False]]), longest_px=9)
     assert filled[0, 1] == 2
     assert np.isnan(filled[0, 2])
 
 
 def test_one_weak_bit_is_no_reason_to_doubt():
-    patterns = [np.uint8([[200, 200]]), np.uint8([[101, 101]]), np.uint8([[150, 100]])]
-    inverses = [np.uint8([[10, 10]]), np.uint8([[100, 100]]), np.uint8([[10, 100]])]
+    patterns = [gray([[200, 200]]), gray([[101, 101]]), gray([[150, 100]])]
+    inverses = [gray([[10, 10]]), gray([[100, 100]]), gray([[10, 100]])]
     assert second_contrast(patterns, inverses).tolist() == [[140, 1]]
 
 
@@ -128,19 +136,19 @@ def test_every_line_belongs_to_one_look_and_is_lit_by_it_alone():
 
 
 def test_noise_is_no_second_light():
-    white, alone = np.float32([[100.0, 100.0]]), np.float32([[98.0, 60.0]])
+    white, alone = f32([[100.0, 100.0]]), f32([[98.0, 60.0]])
     share = second_light(white, alone, np.zeros_like(white), noise_gray=3.0)
     assert share.tolist() == [[0.0, pytest.approx(0.4)]]
 
 
 def test_unqualified_pixels_are_counted_by_how_bright_they_answer():
-    white = np.uint8([[255, 100, 9, 255, 100, 8]])
-    contrast = np.float32([[90, 90, 1, 90, 90, 1]])
+    white = gray([[255, 100, 9, 255, 100, 8]])
+    contrast = f32([[90, 90, 1, 90, 90, 1]])
     lit = np.array([[True, True, True, True, True, False]])
     placed = np.array([[True, False, True, True, True, True]])
     labels = judge_pixels(white, contrast, lit, placed, saturation_gray=254, min_contrast_gray=4)
     assert labels.tolist() == [[OVER_EXPOSED, UNKNOWN_PLACE, UNDER_EXPOSED, OVER_EXPOSED, 0, 0]]
-    most = np.float32([[0.05, 0.5, 1.0, 0.5, 1.0, 1.0]])
+    most = f32([[0.05, 0.5, 1.0, 0.5, 1.0, 1.0]])
     shares = count_shares({"left": labels}, {"left": lit}, {"left": most})
     assert shares == pytest.approx((0.4, 0.2, 0.5, 0.5, 1.0))
 

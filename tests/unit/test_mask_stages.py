@@ -9,6 +9,7 @@ from backend.domain.errors import NotFoundError, StageFailedError
 from backend.domain.frames import Frame, InMemory
 from backend.domain.patterns import Gray, Uniform
 from backend.domain.rig import CameraFacts, ProjectorFacts, RigFacts
+from backend.domain.shots import Shot
 from backend.domain.states import Level
 from backend.jobs.rendering import render
 from backend.stages.base_exposure import BaseExposureParams, base_exposure
@@ -38,7 +39,7 @@ class MapRig:
     bit_depth: int = 8
     cameras: tuple[str, ...] = ("left",)
     ambient: float = 0.0
-    shots: list = field(default_factory=list)
+    shots: list[Shot] = field(default_factory=list)
 
     @property
     def facts(self):
