@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,7 +15,7 @@ pytestmark = pytest.mark.scan
 def unglare(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("UNGLARE_DATA_FOLDER", str(tmp_path / "data"))
 
-    def command(*arguments: str) -> dict:
+    def command(*arguments: str) -> dict[str, Any]:
         status = run([str(argument) for argument in arguments])
         out, err = capsys.readouterr()
         answer = json.loads(out.splitlines()[-1]) if "--json" in arguments else {}
