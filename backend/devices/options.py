@@ -1,4 +1,4 @@
-"""Options of a driver as a pydantic model, refused in one sentence."""
+"""Options of rigs and drivers as pydantic models, refused in one sentence."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
@@ -14,22 +14,24 @@ def _size_from_text(value: object) -> object:
     return value
 
 
+Size = Annotated[tuple[int, int], BeforeValidator(_size_from_text)]
+"""Width and height in [px]; `1280x800` is understood too."""
 _Pixels = Annotated[int, Field(ge=16, le=16384)]
 DisplaySize = Annotated[tuple[_Pixels, _Pixels], BeforeValidator(_size_from_text)]
-"""Width and height in [px]; `1280x800` is understood too."""
+"""The same of a real display."""
 
 
-class DriverOptions(BaseModel):
-    """Base of the options that a driver takes."""
+class DeviceOptions(BaseModel):
+    """Base of the options that a rig or driver takes."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-AnyOptions = TypeVar("AnyOptions", bound=DriverOptions)
+AnyOptions = TypeVar("AnyOptions", bound=DeviceOptions)
 
 
 def read_options(model: type[AnyOptions], device: str, options: Mapping[str, Any]) -> AnyOptions:
-    """Check a device's options.
+    """Check the options of a rig or device, where every value may be text.
 
     Raises
     ------
@@ -39,14 +41,18 @@ def read_options(model: type[AnyOptions], device: str, options: Mapping[str, Any
     try:
         return model.model_validate(dict(options))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        option = str(first["loc"][0]) if first["loc"] else "options"
-        if first["type"] == "extra_forbidden":
-            names = ", ".join(model.model_fields)
-            raise RigConfigError(
-                f"{device}: there is no option {option!r}; the options are {names}"
-            ) from None
-        problem = first["msg"].removeprefix("Value error, ")
-        raise RigConfigError(
-            f"{device}: option {option} can't be used: {problem[0].lower() + problem[1:]}; mend it in the rig's file"
-        ) from None
+        raise RigConfigError(f"{device}: {_problem(model, options, error)}") from None
+
+
+def _problem(model: type[DeviceOptions], options: Mapping[str, Any], error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    message = first["msg"].removeprefix("Value error, ")
+    problem = message[0].lower() + message[1:]
+    if not first["loc"]:
+        return problem
+    option = str(first["loc"][0])
+    if first["type"] == "missing":
+        return f"option {option} is missing; add it"
+    if first["type"] == "extra_forbidden":
+        return f"there is no option {option!r}; the options are {', '.join(model.model_fields)}"
+    return f"option {option} can't be {options.get(option, first['input'])!r}: {problem}"

@@ -22,7 +22,6 @@ from backend.devices.drivers.aravis_library import (
     aravis,
     on_control_lost,
 )
-from backend.devices.drivers.link import DriverLink
 from backend.devices.errors import (
     DeviceBusy,
     DeviceDisconnected,
@@ -33,7 +32,8 @@ from backend.devices.errors import (
     IncompleteFrame,
     UnsupportedFeature,
 )
-from backend.devices.options import DriverOptions, read_options
+from backend.devices.link import Link
+from backend.devices.options import DeviceOptions, read_options
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -65,7 +65,7 @@ _UNKNOWN = CameraCapabilities((0, 0), (), Range(0, 0), Range(0, 0), ())
 """Before a camera was opened: it can't be set to anything."""
 
 
-class AravisOptions(DriverOptions):
+class AravisOptions(DeviceOptions):
     """How a camera is found and connected; one of address and serial."""
 
     address: str = ""
@@ -89,7 +89,7 @@ def create_camera(name: str, options: Mapping[str, Any]) -> "AravisCamera":
     return AravisCamera(name, read_options(AravisOptions, name, options))
 
 
-class AravisCamera(DriverLink):
+class AravisCamera(Link):
     """A `Camera`. One thread at a time, except for `abort` and `state`."""
 
     def __init__(self, name: str, options: AravisOptions) -> None:

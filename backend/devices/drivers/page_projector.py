@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from backend.devices.drivers.link import DriverLink
 from backend.devices.errors import (
     DeviceDisconnected,
     DeviceError,
@@ -22,7 +21,8 @@ from backend.devices.errors import (
     FeatureError,
     GeometryError,
 )
-from backend.devices.options import DisplaySize, DriverOptions, read_options
+from backend.devices.link import Link
+from backend.devices.options import DeviceOptions, DisplaySize, read_options
 from backend.devices.pages import Geometry, Page, PageDesk
 from backend.devices.protocols import DeviceInfo, LinkState, Presented, ProjectorCapabilities
 
@@ -30,7 +30,7 @@ _JOIN_S = 5.0
 _GEOMETRY_S = 2.0
 
 
-class PageOptions(DriverOptions):
+class PageOptions(DeviceOptions):
     """How the page's screen is driven."""
 
     size: DisplaySize
@@ -47,7 +47,7 @@ def create_projector(name: str, options: Mapping[str, Any], desk: PageDesk) -> "
     return PageProjector(name, read_options(PageOptions, name, options), desk)
 
 
-class PageProjector(DriverLink):
+class PageProjector(Link):
     """A `Projector` in a browser."""
 
     def __init__(self, name: str, options: PageOptions, desk: PageDesk) -> None:

@@ -26,7 +26,7 @@ from backend.devices.protocols import (
     TriggerSource,
 )
 from backend.devices.sim.clock import Clock
-from backend.devices.sim.link import Link
+from backend.devices.sim.link import SimulatedLink
 from backend.devices.sim.renderer import Shown
 
 _READOUT_S = 0.004
@@ -114,7 +114,7 @@ Develop = Callable[[Exposure], UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h 
 """Makes the picture of an exposure."""
 
 
-class SimulatedCamera(Link):
+class SimulatedCamera(SimulatedLink):
     """A `Camera`. Exposures queue up when triggered and are rendered when their frame is fetched."""
 
     def __init__(

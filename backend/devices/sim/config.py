@@ -2,7 +2,8 @@
 
 from pydantic import ConfigDict, Field, field_validator
 
-from backend.devices.sim.options import RigOptions, Size
+from backend.devices.options import Size
+from backend.devices.sim.options import RigOptions
 
 
 class SimulatedRigConfig(RigOptions):

@@ -8,10 +8,10 @@ from jaxtyping import UInt8
 
 from backend.devices.errors import FeatureError, GeometryError
 from backend.devices.protocols import DeviceInfo, Presented
-from backend.devices.sim.link import Link
+from backend.devices.sim.link import SimulatedLink
 
 
-class Display(Link):
+class Display(SimulatedLink):
     """A display of fixed size; how a pattern comes to light is up to its kind."""
 
     def __init__(self, name: str, info: DeviceInfo, size: tuple[int, int]) -> None:

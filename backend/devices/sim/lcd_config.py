@@ -4,8 +4,9 @@ from typing import Literal
 
 from pydantic import AliasChoices, ConfigDict, Field, field_validator
 
+from backend.devices.options import Size
 from backend.devices.sim.chains import CHAINS
-from backend.devices.sim.options import RigOptions, Size
+from backend.devices.sim.options import RigOptions
 
 Defect = Literal["dropped", "duplicated", "dimmed"]
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
 from backend.devices.errors import RigConfigError
+from backend.devices.options import read_options
 from backend.devices.protocols import Camera, DeviceInfo
 from backend.devices.sim import kernels, lcd_kernels
 from backend.devices.sim.camera import Exposure, SimulatedCamera
@@ -47,7 +48,7 @@ def create_lcd_rig(config: Mapping[str, object]) -> "SimulatedLcdRig":
     RigConfigError
         If an option or the scene is unknown or can't be used.
     """
-    return SimulatedLcdRig(SimulatedLcdConfig.from_options(config))
+    return SimulatedLcdRig(read_options(SimulatedLcdConfig, "simulated rig", config))
 
 
 create_lcd_rig.options_model = SimulatedLcdConfig  # type: ignore[attr-defined]  # read by loading.options_schema

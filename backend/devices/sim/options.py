@@ -1,29 +1,14 @@
-"""What the options of all simulated rigs have in common: sizes, ranges, and one sentence per refusal."""
+"""What the options of all simulated rigs have in common: the ranges of sizes, depths and exposures."""
 
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import field_validator
 
-from backend.devices.errors import RigConfigError
-
-Size = tuple[int, int]
-
-Options = TypeVar("Options", bound="RigOptions")
-"""Not `Self`: the shape checks of the tests can't execute that on single methods."""
+from backend.devices.options import DeviceOptions, Size
 
 
-class RigOptions(BaseModel):
+class RigOptions(DeviceOptions):
     """Options of a simulated rig, checked."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    @field_validator("size", "projector_size", "screen_size", mode="before", check_fields=False)
-    @classmethod
-    def _size_from_text(cls, value: object) -> object:
-        if isinstance(value, str) and value.lower().count("x") == 1:
-            return tuple(part.strip() for part in value.lower().split("x"))
-        return value
 
     @field_validator("size", "projector_size", "screen_size", check_fields=False)
     @classmethod
@@ -47,27 +32,3 @@ class RigOptions(BaseModel):
         if value <= shortest:
             raise ValueError(f"{value:g} is not above exposure_min_ms {shortest:g}")
         return value
-
-    @classmethod
-    def from_options(cls: type[Options], options: Mapping[str, object]) -> Options:
-        """Read a mapping, e.g. from the command line, where every value may be text.
-
-        Raises
-        ------
-        RigConfigError
-            If a key is unknown or a value can't be used; one sentence names the first of them.
-        """
-        try:
-            return cls.model_validate(dict(options))
-        except ValidationError as error:
-            raise RigConfigError(_sentence(cls, error)) from None
-
-
-def _sentence(model: type[RigOptions], error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
-    option = str(first["loc"][0]) if first["loc"] else "options"
-    if first["type"] == "extra_forbidden":
-        names = ", ".join(model.model_fields)
-        return f"simulated rig: there is no option {option!r}; the options are {names}"
-    problem = first["msg"].removeprefix("Value error, ")
-    return f"simulated rig: option {option} can't be {first['input']!r}: {problem[0].lower() + problem[1:]}"

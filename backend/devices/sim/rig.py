@@ -9,6 +9,7 @@ from threading import Lock
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
+from backend.devices.options import read_options
 from backend.devices.protocols import Camera, DeviceInfo
 from backend.devices.sim.camera import Exposure, SimulatedCamera
 from backend.devices.sim.clock import Clock
@@ -38,7 +39,7 @@ def create_rig(config: Mapping[str, object]) -> "SimulatedRig":
     RigConfigError
         If an option or the scene is unknown or can't be used.
     """
-    return SimulatedRig(SimulatedRigConfig.from_options(config))
+    return SimulatedRig(read_options(SimulatedRigConfig, "simulated rig", config))
 
 
 create_rig.options_model = SimulatedRigConfig  # type: ignore[attr-defined]  # read by loading.options_schema

@@ -1,15 +1,15 @@
-"""The part that drivers share: a device's life, and what it is refused in which state."""
+"""The part that cameras and projectors share, real and simulated: a device's life, and what is refused in which state."""
 
 from typing import TypeVar
 
 from backend.devices.errors import DeviceDisconnected
 from backend.devices.protocols import DeviceInfo, LinkState
 
-AnyLink = TypeVar("AnyLink", bound="DriverLink")
+AnyLink = TypeVar("AnyLink", bound="Link")
 """Not `Self`: the shape checks of the tests can't execute that on single methods."""
 
 
-class DriverLink:
+class Link:
     """A device's life as `backend.devices.protocols` draws it; drivers set the state."""
 
     def __init__(self, name: str, info: DeviceInfo) -> None:
