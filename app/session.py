@@ -494,11 +494,12 @@ class Session:
             return
         kept = self.api.calibrations(look.scan.rig) if look.scan.rig else ()
         offered = [c for c in kept if c.type == type_name and c.withdrawn is None]
+        title = next((h.title for h in look.scan.handed if h.type == type_name), type_name)
 
         def give(source: GivenSource) -> None:
             self.act(lambda: self._take(self.api.give(look.scan.id, type_name, source)))
 
-        ask_calibration(self._gui, type_name, offered, give)
+        ask_calibration(self._gui, title, offered, give)
 
     def _ask_export(self) -> None:
         look = self._look

@@ -64,12 +64,12 @@ class HandedPanel:
 
 def ask_calibration(
     gui: viser.GuiApi,
-    type_name: str,
+    title: str,
     offered: Sequence[CalibrationView],
     on_choice: Callable[[GivenSource], None],
 ) -> None:
     """Ask for a calibration of the rig, or for a scan whose result is taken."""
-    modal = gui.add_modal(f"Which {type_name}?")
+    modal = gui.add_modal(f"Which {title.lower()}?")
     titles = {
         f"{c.number}: {c.scan_name or c.scan}, {c.who}, {c.when:%d %b %Y %H:%M}": c.number
         for c in offered

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from backend.domain.method import Method
 from backend.domain.rig import RigCalibration, RigFacts
+from backend.domain.type_names import words
 from backend.storage.repositories import Repositories
 from backend.storage.rows import CalibrationRow, GivenRow
 
@@ -82,15 +83,3 @@ def origin(repositories: Repositories, calibration: CalibrationRow) -> dict[str,
         "scan": calibration.scan,
         "stage": calibration.stage,
     }
-
-
-def words(type_name: str) -> str:
-    """Write a type's name as words.
-
-    Examples
-    --------
-    >>> words("TableHomography"), words("Ramp")
-    ('Table homography', 'Ramp')
-    """
-    spaced = "".join(f" {c.lower()}" if c.isupper() else c for c in type_name).strip()
-    return spaced[:1].upper() + spaced[1:]

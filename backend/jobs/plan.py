@@ -15,6 +15,7 @@ from backend.domain.params import without_cosmetics
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.stage import Stage
 from backend.domain.states import Level, Review, Verdict
+from backend.domain.type_names import words
 from backend.jobs.edits import resolve_settings
 from backend.jobs.stage_settings import StageSettings
 from backend.storage.rows import DecisionRow, GivenRow, RunRow
@@ -210,7 +211,7 @@ def _source(
     given: Mapping[str, GivenRow],
     has_rig: bool,
 ) -> _Source:
-    name, wanted = wire.input.name, wire.input.type
+    name = wire.input.name
     if wire.source is None:
         return _given_source(wire, given, has_rig)
     maker = earlier[wire.source]
@@ -220,9 +221,7 @@ def _source(
         return _Source(name, waits_for=wire.source)
     if wire.input.optional:
         return _Source(name)
-    return _Source(
-        name, missing=f"needs {wanted.__name__} from {wire.source}, which {maker.missing}"
-    )
+    return _Source(name, missing=f"needs {maker.stage.title}, which {maker.missing}")
 
 
 def _given_source(wire: Wire, given: Mapping[str, GivenRow], has_rig: bool) -> _Source:
@@ -235,7 +234,7 @@ def _given_source(wire: Wire, given: Mapping[str, GivenRow], has_rig: bool) -> _
     if wire.input.optional:
         return _Source(name)
     reason = "the rig hands over none" if has_rig and wanted in _OF_RIG else "nothing supplies it"
-    return _Source(name, missing=f"needs {wanted.__name__}, and {reason}")
+    return _Source(name, missing=f"needs {words(wanted.__name__).lower()}, and {reason}")
 
 
 def run_level(run: RunRow) -> Level:

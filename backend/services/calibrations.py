@@ -12,7 +12,8 @@ from backend.contract.scans import CalibrationView, ScanState
 from backend.domain.errors import ConflictError, InvalidCaptureError, NotFoundError
 from backend.domain.method import Method
 from backend.domain.states import Level, Verdict
-from backend.jobs.calibrations import give_calibration, rig_identity, words
+from backend.domain.type_names import words
+from backend.jobs.calibrations import give_calibration, rig_identity
 from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
 from backend.jobs.plan import PlannedStage, run_level
 from backend.methods import Registry

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from backend.contract.scans import HandedView
 from backend.domain.method import Method
 from backend.domain.stage import Stage
-from backend.jobs.calibrations import words
+from backend.domain.type_names import words
 from backend.methods import Registry
 from backend.storage.rows import GivenRow
 

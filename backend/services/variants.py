@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 from backend.contract.requests import EditSettings, StartRun
 from backend.domain.errors import StageUnavailableError, UnglareError
+from backend.domain.type_names import words
 from backend.jobs.loading import LoadedScan
 from backend.services import editing, running
 from backend.services.context import Context
@@ -111,7 +112,7 @@ def present_result(
             found: T = decode(document_of(repositories, planned.result), kind, context.store)
             return found
     raise StageUnavailableError(
-        f"{loaded.title!r} has no {kind.__name__}: run it at least to the stage that makes one."
+        f"{loaded.title!r} has no {words(kind.__name__).lower()}: run it at least to the stage that makes one."
     )
 
 
@@ -125,7 +126,9 @@ def given_result(context: Context, loaded: LoadedScan, kind: type[T]) -> T:
     """
     row = loaded.given.get(kind.__name__)
     if row is None:
-        raise StageUnavailableError(f"{loaded.title!r} has no {kind.__name__}: calibrate the rig.")
+        raise StageUnavailableError(
+            f"{loaded.title!r} has no {words(kind.__name__).lower()}: calibrate the rig."
+        )
     found: T = decode(row.document, kind, context.store)
     return found
 

@@ -440,11 +440,11 @@ def test_until_ends_early(house: House) -> None:
 def test_without_calibration_only_the_last_stage_is_unavailable(house: House) -> None:
     state = house.run_through(house.create(rig_options={"calibrated": False}).id)
     assert statuses(state) == {**DONE, "cloud": "unavailable"}
-    message = "Unavailable: needs RigCalibration, and the rig hands over none."
+    message = "Unavailable: needs rig calibration, and the rig hands over none."
     assert stage(state, "toy_cloud").message == message
     assert state.status == "done"
     with pytest.raises(
-        StageUnavailableError, match="toy_cloud is unavailable: needs RigCalibration"
+        StageUnavailableError, match="toy_cloud is unavailable: needs rig calibration"
     ):
         house.run(state.id, until="toy_cloud")
 

@@ -182,7 +182,7 @@ def test_an_imported_scan_starts_in_the_middle() -> None:
         == "needs a rig, and this scan has none: its frames were imported"
     )
     assert found.stage("toy_levels").missing == (
-        "needs Look from toy_look, which needs a rig, and this scan has none: its frames were imported"
+        "needs Look, which needs a rig, and this scan has none: its frames were imported"
     )
     assert found.stage("toy_phase").inputs["levels"] is None, "optional"
 
@@ -213,9 +213,9 @@ def test_a_missing_input_stops_only_what_needs_it() -> None:
     past = Past()
     assert walk(past, given=given) == ALL[:-1]
     found = plan(past, given=given)
-    assert found.stage("toy_cloud").missing == "needs RigCalibration, and the rig hands over none"
+    assert found.stage("toy_cloud").missing == "needs rig calibration, and the rig hands over none"
     with pytest.raises(
-        StageUnavailableError, match="toy_cloud is unavailable: needs RigCalibration"
+        StageUnavailableError, match="toy_cloud is unavailable: needs rig calibration"
     ):
         next_step(found, until="toy_cloud", unattended=False)
 
