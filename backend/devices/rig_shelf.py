@@ -1,6 +1,5 @@
 """The rigs of one station: built in, from packages, and the files in its folder."""
 
-import json
 import re
 import shutil
 from collections.abc import Mapping
@@ -18,6 +17,8 @@ from backend.devices.rig_file import RigFile, assemble
 
 LATENCY_SUFFIX = ".latency.json"
 """Beside a rig's file: what the latency calibration found."""
+ASSUMED_REFRESH_HZ = 60.0
+"""Of a display that tells no refresh rate."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,40}")
 
 
@@ -27,7 +28,18 @@ class DisplayMode(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     size: DisplaySize
-    refresh_hz: float = 60.0
+    refresh_hz: float | None = ASSUMED_REFRESH_HZ
+
+    @property
+    def mode(self) -> tuple[tuple[int, int], float]:
+        """What has to be the same."""
+        return self.size, self.refresh_hz or ASSUMED_REFRESH_HZ
+
+
+class KnownLatency(DisplayMode):
+    """What is read of the file beside a rig's file."""
+
+    settle_ms: float
 
 
 @dataclass(frozen=True)
@@ -54,8 +66,9 @@ class RigShelf:
         self._desk = desk
 
     def kept(self) -> tuple[KeptRig, ...]:
-        """Return the files, by name."""
-        return tuple(KeptRig(path.stem, path) for path in sorted(self._folder.glob("*.yaml")))
+        """Return the files, by name; one whose name is no rig's couldn't be opened and is left out."""
+        paths = sorted(self._folder.glob("*.yaml"))
+        return tuple(KeptRig(path.stem, path) for path in paths if _NAME.fullmatch(path.stem))
 
     def open(self, name: str, options: Mapping[str, object]) -> Rig:
         """Make a rig: of its file if there is one, else by its name.
@@ -77,15 +90,19 @@ class RigShelf:
     def _with_latency(self, name: str, file: RigFile) -> RigFile:
         """Let the projector wait as long as was measured, unless its entry says how long or has changed since."""
         try:
-            known = json.loads((self._folder / f"{name}{LATENCY_SUFFIX}").read_text())
+            text = self._latency_path(name).read_text("utf-8")
+            known = KnownLatency.model_validate_json(text)
             said = dict(file.projector.model_extra or {})
-            same = DisplayMode.model_validate(known) == DisplayMode.model_validate(said)
+            same = known.mode == DisplayMode.model_validate(said).mode
         except (OSError, ValueError):
             return file
         if not same or "settle_ms" in said:
             return file
-        projector = file.projector.model_copy(update={"settle_ms": known["settle_ms"]})
+        projector = file.projector.model_copy(update={"settle_ms": known.settle_ms})
         return file.model_copy(update={"projector": projector})
+
+    def _latency_path(self, name: str) -> Path:
+        return self._folder / f"{name}{LATENCY_SUFFIX}"
 
     @property
     def folder(self) -> Path:
@@ -110,20 +127,29 @@ class RigShelf:
                 f"there is a rig {name!r} already; remove it first, or choose another name"
             )
         assemble(name, RigFile.read(source), self._desk)
-        self._folder.mkdir(parents=True, exist_ok=True)
         target = self._folder / f"{name}.yaml"
-        shutil.copyfile(source, target)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
+        except OSError as error:
+            raise RigConfigError(
+                f"rig file {target} can't be written ({error.strerror}); check the data folder's rights and space"
+            ) from error
         return KeptRig(name, target)
 
     def remove(self, name: str) -> Path:
-        """Take a file off the shelf; it is renamed, not deleted, and returned.
+        """Take a file off the shelf, and its latency, which needn't hold for the next rig of that name.
+
+        Both are renamed, not deleted; the rig's is returned.
 
         Raises
         ------
         RigNotFoundError
             If there is none of this name.
         """
-        path = self.require(name)
+        path, latency = self.require(name), self._latency_path(name)
+        if latency.exists():
+            latency.rename(latency.with_name(f"{latency.name}.removed"))
         return path.rename(path.with_suffix(".yaml.removed"))
 
     def require(self, name: str) -> Path:

@@ -17,8 +17,9 @@ from backend.devices.protocols import (
     Frame,
     Presented,
     ProjectorCapabilities,
+    TriggerSource,
 )
-from backend.devices.rig_shelf import LATENCY_SUFFIX
+from backend.devices.rig_shelf import ASSUMED_REFRESH_HZ, LATENCY_SUFFIX
 from backend.domain.errors import StageFailedError
 from backend.domain.shots import Progress
 from backend.jobs.rigs import Owner
@@ -30,6 +31,7 @@ REPETITIONS = 10
 _LONGEST_MS = 400.0
 _AGREEING = 3
 """So many delays in a row have to be complete before a longer one isn't tried."""
+_FULL_SCALE_GRAY = 255.0
 _STEADY_S = 0.6
 """After that any display shows what it was asked to."""
 
@@ -179,8 +181,9 @@ class _Bench:
         self._projector = projector
         self._clock = clock
         self._cameras = tuple(cameras)
-        refresh_hz = projector.capabilities.refresh_hz or 60.0
-        self._period_ms = 1000.0 / refresh_hz
+        # As the projector tells it: the rig's file is compared with what is kept, to the last bit.
+        self._refresh_hz = projector.capabilities.refresh_hz or ASSUMED_REFRESH_HZ
+        self._period_ms = 1000.0 / self._refresh_hz
         self._exposure_ms = self._shortest_exposure()
 
     def measure(self, repetitions: int, progress: Progress) -> Latency:
@@ -212,7 +215,11 @@ class _Bench:
     def _arm(self) -> None:
         for camera in self._cameras:
             camera.configure(
-                replace(camera.settings, exposure_us=round(self._exposure_ms * 1000.0, 3))
+                replace(
+                    camera.settings,
+                    exposure_us=round(self._exposure_ms * 1000.0, 3),
+                    trigger=TriggerSource.SOFTWARE,
+                )
             )
             camera.arm()
 
@@ -227,15 +234,11 @@ class _Bench:
 
     def _refuse_darkness(self, steady: Mapping[int, list[Gray]]) -> None:
         for camera, dark, bright in zip(self._cameras, steady[0], steady[255], strict=True):
-            if np.count_nonzero(self._lit(dark, bright)) < 100:
+            if np.count_nonzero(_lit(dark, bright)) < 100:
                 raise StageFailedError(
                     f"Camera {camera.name} doesn't see the projector's light at {self._exposure_ms:.1f} ms: put a bright"
                     " surface before it, open the aperture, or check what the projector shows."
                 )
-
-    def _lit(self, dark: Gray, bright: Gray) -> Bool[np.ndarray, "h w"]:
-        full_scale_gray = 255.0 if bright.max() <= 255 else 4095.0
-        return changing_pixels(dark, bright, full_scale_gray=full_scale_gray)
 
     def _settling(
         self,
@@ -255,9 +258,8 @@ class _Bench:
                     f"The projector doesn't settle within {_LONGEST_MS:g} ms from {what}: check that the cameras see its"
                     " screen and that nothing else changes the light."
                 )
-            progress(
-                min(delay_ms / 150.0, 0.95), f"{what}, {delay_ms:.0f} ms after the acknowledgement"
-            )
+            done = min(delay_ms / 150.0, 0.95) / 2 + (0.0 if target else 0.5)
+            progress(done, f"{what}, {delay_ms:.0f} ms after the acknowledgement")
             shares.append([self._shares(target, steady, delay_ms) for _ in range(repetitions)])
             delays_ms.append(delay_ms)
         return Settling(np.array(delays_ms), np.array(shares).transpose(1, 2, 0))
@@ -270,7 +272,7 @@ class _Bench:
         self._clock.sleep(_STEADY_S)
         pictures = self._pictures(target, delay_ms / 1000.0)
         return [
-            share_of_change(gray, before, after, self._lit(dark, bright))
+            share_of_change(gray, before, after, _lit(dark, bright))
             for gray, before, after, dark, bright in zip(
                 pictures, steady[start], steady[target], steady[0], steady[255], strict=True
             )
@@ -280,7 +282,7 @@ class _Bench:
         longest = max(up.delays_ms, down.delays_ms, key=len)
         return Latency(
             settle_ms=max(up.over_ms, down.over_ms) + self._period_ms,
-            refresh_hz=1000.0 / self._period_ms,
+            refresh_hz=self._refresh_hz,
             size=self._projector.capabilities.size,
             exposure_ms=self._exposure_ms,
             delays_ms=tuple(longest.tolist()),
@@ -291,7 +293,13 @@ class _Bench:
 
 
 def _gray(camera: Taking) -> Gray:
-    return camera.get_frame().data.astype(np.float64)
+    """Return a picture on the scale of 8 bits, whatever the camera's depth."""
+    frame = camera.get_frame()
+    return np.asarray(frame.data * (_FULL_SCALE_GRAY / (2**frame.bits - 1)), np.float64)
+
+
+def _lit(dark: Gray, bright: Gray) -> Bool[np.ndarray, "h w"]:
+    return changing_pixels(dark, bright, full_scale_gray=_FULL_SCALE_GRAY)
 
 
 def _worst(repetitions: list[list[float]]) -> float:

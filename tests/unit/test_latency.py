@@ -1,6 +1,5 @@
 """The latency calibration, on a screen that lags by a known time and cameras that integrate its light."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from backend.devices.protocols import (
     Presented,
     ProjectorCapabilities,
     Range,
+    TriggerSource,
 )
 from backend.devices.rig_shelf import RigShelf
 from backend.domain.errors import StageFailedError
@@ -40,9 +40,8 @@ class VirtualTime:
 class LaggingScreen:
     """Acknowledges at once, and changes `lag_s` later."""
 
-    capabilities = ProjectorCapabilities(size=(64, 48), refresh_hz=240.0)
-
-    def __init__(self, lag_s: float, clock: VirtualTime) -> None:
+    def __init__(self, lag_s: float, clock: VirtualTime, refresh_hz: float = 240.0) -> None:
+        self.capabilities = ProjectorCapabilities(size=(64, 48), refresh_hz=refresh_hz)
         self.lag_s, self.clock = lag_s, clock
         self.settle_ms: float | None = 99.0
         self.changes: list[tuple[float, int]] = [(0.0, 0)]
@@ -68,13 +67,15 @@ class Camera:
 
     capabilities = CameraCapabilities((32, 24), ("Mono8",), Range(1000, 1e6), Range(0, 0), ())
 
-    def __init__(self, name: str, screen: LaggingScreen, gray: float = 200.0) -> None:
-        self.name, self._screen, self._gray = name, screen, gray
+    def __init__(
+        self, name: str, screen: LaggingScreen, gray: float = 200.0, bits: int = 8
+    ) -> None:
+        self.name, self._screen, self._gray, self._bits = name, screen, gray, bits
         self.settings = CameraSettings(1000.0)
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        self.settings = replace(self.settings, exposure_us=settings.exposure_us)
-        return self.settings
+        self.settings = settings
+        return settings
 
     def arm(self, n_frames: int | None = None) -> None: ...
     def disarm(self) -> None: ...
@@ -89,10 +90,11 @@ class Camera:
     def get_frame(self, timeout_s: float = 2.0) -> Frame:
         picture = np.full((24, 32), 4.0)
         picture[4:20, 4:28] += self._gray * self._light / 255.0
+        picture *= (2**self._bits - 1) / 255
         return Frame(
-            picture.round().astype(np.uint8),
-            "Mono8",
-            8,
+            picture.round().astype(np.uint8 if self._bits == 8 else np.uint16),
+            f"Mono{self._bits}",
+            self._bits,
             0,
             self.settings.exposure_us,
             0.0,
@@ -105,10 +107,12 @@ def _silent(done: float, text: str = "") -> None:
     """Nobody listens."""
 
 
-def measured(lag_s: float, gray: float = 200.0) -> latency.Latency:
+def measured(
+    lag_s: float, gray: float = 200.0, *, bits: int = 8, refresh_hz: float = 240.0
+) -> latency.Latency:
     clock = VirtualTime()
-    screen = LaggingScreen(lag_s, clock)
-    cameras = [Camera(name, screen, gray) for name in ("left", "right")]
+    screen = LaggingScreen(lag_s, clock, refresh_hz)
+    cameras = [Camera(name, screen, gray, bits) for name in ("left", "right")]
     try:
         return latency.latency_of(screen, cameras, _silent, repetitions=10, clock=clock)
     finally:
@@ -137,15 +141,65 @@ def test_a_change_counts_as_over_when_all_cameras_and_repetitions_agree() -> Non
     assert np.isnan(first_complete_ms(np.array([0.0, 8.0, 17.0, 25.0]), shares))
 
 
-@pytest.mark.parametrize(("size", "settles"), [("64x48", 29.2), ("128x96", None)])
-def test_it_holds_for_the_mode_that_it_was_measured_in(
-    size: str, settles: float | None, tmp_path: Path
-) -> None:
-    shelf = RigShelf(tmp_path, PageDesk())
-    text = f"cameras: {{left: {{driver: aravis, address: 192.0.2.2}}}}\nprojector: {{driver: page, size: {size}, refresh_hz: 240}}"
-    (tmp_path / "bench.yaml").write_text(text)
-    found = latency.Latency(29.2, 240.0, (64, 48), 4.2, (0.0,), (1.0,), (1.0,), "2026-11-23")
-    found.keep(shelf.folder, "bench")
+def test_twelve_bits_are_judged_on_their_own_scale() -> None:
+    assert measured(0.02, bits=12).settle_ms == measured(0.02).settle_ms
+
+
+def test_a_camera_that_waits_for_a_line_is_triggered_by_software() -> None:
+    clock = VirtualTime()
+    screen = LaggingScreen(0.0, clock)
+    camera = Camera("left", screen)
+    camera.settings = CameraSettings(1000.0, trigger=TriggerSource.LINE1)
+    latency.latency_of(screen, [camera], _silent, repetitions=1, clock=clock)
+    assert camera.settings.trigger is TriggerSource.SOFTWARE
+
+
+def shelf_with_bench(folder: Path, projector: str) -> RigShelf:
+    text = f"cameras: {{left: {{driver: aravis, address: 192.0.2.2}}}}\nprojector: {{driver: page, {projector}}}"
+    (folder / "bench.yaml").write_text(text)
+    return RigShelf(folder, PageDesk())
+
+
+def settle_ms(shelf: RigShelf) -> float | None:
     projector = shelf.open("bench", {}).projector
     assert isinstance(projector, PageProjector)
-    assert projector.settle_ms == settles
+    return projector.settle_ms
+
+
+@pytest.mark.parametrize(
+    ("projector", "same"),
+    [
+        ("size: 64x48, refresh_hz: 60", True),
+        ("size: 64x48", True),
+        ("size: 64x48, refresh_hz: null", True),
+        ("size: 128x96, refresh_hz: 60", False),
+        ("size: 64x48, refresh_hz: 75", False),
+    ],
+)
+def test_it_holds_for_the_mode_that_it_was_measured_in(
+    projector: str, same: bool, tmp_path: Path
+) -> None:
+    shelf = shelf_with_bench(tmp_path, projector)
+    found = measured(0.02, refresh_hz=60.0)
+    found.keep(shelf.folder, "bench")
+    assert settle_ms(shelf) == (found.settle_ms if same else None)
+
+
+def test_what_the_rigs_file_says_counts_more(tmp_path: Path) -> None:
+    shelf = shelf_with_bench(tmp_path, "size: 64x48, refresh_hz: 60, settle_ms: 17")
+    measured(0.02, refresh_hz=60.0).keep(shelf.folder, "bench")
+    assert settle_ms(shelf) == 17
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"size": [64, 48], "refresh_hz": 60}'])
+def test_a_file_that_says_no_latency_is_passed_over(text: str, tmp_path: Path) -> None:
+    shelf = shelf_with_bench(tmp_path, "size: 64x48, refresh_hz: 60")
+    (tmp_path / "bench.latency.json").write_text(text)
+    assert settle_ms(shelf) is None
+
+
+def test_the_next_rig_of_that_name_has_no_latency(tmp_path: Path) -> None:
+    shelf = shelf_with_bench(tmp_path, "size: 64x48")
+    measured(0.02, refresh_hz=60.0).keep(shelf.folder, "bench")
+    shelf.remove("bench")
+    assert settle_ms(shelf_with_bench(tmp_path, "size: 64x48")) is None
