@@ -121,7 +121,7 @@ def test_what_cant_be_imported_leaves_nothing_behind(
     assert answer.status_code == status
     assert answer.headers["content-type"] == "application/problem+json"
     assert imports.seen == []
-    assert list((data / "uploads").iterdir()) == []
+    assert list((data / "uploads").glob("*")) == []  # made by the first upload that is let in
     assert not (data / "outside").exists()
 
 
