@@ -29,7 +29,7 @@ from backend.devices.rig_shelf import RigShelf
 from backend.domain.errors import StartupError
 from backend.jobs.execution import Workshop
 from backend.jobs.rigs import OpenRig, RigPool
-from backend.jobs.runner import LocalRunner, Runner
+from backend.jobs.runner import InlineRunner, LocalRunner, Runner
 from backend.methods import registry
 from backend.numerics.warm_up import warm_up
 from backend.services.events import EventHub
@@ -215,6 +215,43 @@ def serve(
                     target=prepare, args=(services,), name="prepare", daemon=True
                 ).start()
             server_for(app, trusted_proxies=settings.trusted_proxies).run(sockets=[listening])
+
+
+@contextlib.contextmanager
+def serve_pages(
+    settings: Settings, *, announce: Callable[[str], None] = _say
+) -> Iterator[tuple[Services, PageDesk]]:
+    """Serve projector pages for one command, without the station.
+
+    Yields the services, whose rigs find the pages, and the desk where the pages come in.
+
+    Raises
+    ------
+    StartupError
+        If it can't start, e.g. because a server runs already: the pages are with that one.
+    """
+    token = settings.token.get_secret_value() if settings.token else secrets.token_urlsafe(24)
+    with (
+        _alone_in(settings.data_folder),
+        contextlib.closing(public_socket(settings.host, settings.port)) as listening,
+    ):
+        port, pages = listening.getsockname()[1], PageDesk()
+        with contextlib.closing(
+            build_services(settings, make_runner=InlineRunner, pages=pages)
+        ) as services:
+            bare = settings.model_copy(update={"station": False})
+            app = build_application(bare, services, port=port, token=token, pages=pages)
+            server = server_for(app, trusted_proxies=settings.trusted_proxies)
+            serving = threading.Thread(
+                target=server.run, kwargs={"sockets": [listening]}, name="pages", daemon=True
+            )
+            serving.start()
+            try:
+                announce(f"http://{_reachable(settings.host)}:{port}/projector?token={token}")
+                yield services, pages
+            finally:
+                server.should_exit = True
+                serving.join()
 
 
 def configure_logging(level: str) -> None:

@@ -138,6 +138,12 @@ class RigFile(_Part):
                 f"rig file {name}: {place}: {problem[0].lower() + problem[1:]}; mend it"
             ) from None
 
+    @property
+    def page(self) -> str | None:
+        """Name of the projector page that shows its patterns; None where no page does."""
+        options = self.projector.model_extra or {}
+        return str(options.get("page", "projector")) if self.projector.driver == "page" else None
+
     @model_validator(mode="after")
     def _no_strangers(self) -> "RigFile":
         if self.calibration is not None and set(self.calibration.cameras) != set(self.cameras):

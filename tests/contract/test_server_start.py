@@ -12,6 +12,8 @@ from pathlib import Path
 
 import httpx
 import pytest
+from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from backend.contract.requests import CreateScan
 from backend.devices.pages import PageDesk
@@ -19,7 +21,7 @@ from backend.devices.rig_shelf import RigShelf
 from backend.domain.errors import StartupError
 from backend.domain.states import JobStatus
 from backend.jobs.runner import InlineRunner
-from backend.main import build_application, build_services, rig_offers, rig_opener
+from backend.main import build_application, build_services, rig_offers, rig_opener, serve_pages
 from backend.settings import Settings, load_settings
 from backend.storage.database import utc_now
 from backend.storage.rows import JobRow
@@ -170,6 +172,28 @@ def test_the_stations_own_rig_is_offered_first_and_opened_with_its_options(
         ("lab.rigs:shiny", {"port": 7, "fast": False}),
         ("simulated", {"seed": 1}),
     ]
+
+
+def test_a_command_may_serve_projector_pages_by_itself(tmp_path: Path) -> None:
+    said: list[str] = []
+    with serve_pages(settings_in(tmp_path, port=0), announce=said.append) as (_, pages):
+        address = httpx.URL(said[0])
+        with httpx.Client(trust_env=False) as client:
+            assert client.get(address).status_code == 303
+            cookie = "; ".join(f"{name}={value}" for name, value in client.cookies.items())
+        origin = f"http://{address.host}:{address.port}"
+        with connect(
+            f"ws://{address.host}:{address.port}/ws/projector?name=bench",
+            origin=Origin(origin),
+            additional_headers={"Cookie": cookie},
+            proxy=None,
+        ):
+            assert pages.find("bench", 10.0) is not None
+        with (
+            pytest.raises(StartupError, match="Another server uses the data folder"),
+            serve_pages(settings_in(tmp_path, port=0), announce=said.append),
+        ):
+            pass
 
 
 def test_without_any_token_there_is_no_application(tmp_path: Path) -> None:

@@ -46,6 +46,18 @@ def test_a_rig_is_made_of_its_file(tmp_path: Path, shelf: RigShelf) -> None:
     assert rig.calibration() is None
 
 
+@pytest.mark.parametrize(
+    ("projector", "page"),
+    [("page, size: 64x48", "projector"), ("page, page: left", "left"), ("beamer, page: 3", None)],
+)
+def test_a_file_says_which_page_it_needs(projector: str, page: str | None) -> None:
+    driver, _, options = projector.partition(", ")
+    name, _, value = options.partition(": ")
+    entry = {"driver": driver, name: value}
+    cameras = {"left": {"driver": "aravis", "address": "192.0.2.2"}}
+    assert RigFile.of({"cameras": cameras, "projector": entry}, "test").page == page
+
+
 def test_names_of_the_shelf_come_first_and_others_still_open(shelf: RigShelf) -> None:
     assert shelf.kept() == ()
     assert shelf.open("simulated", {"scene": "plane"}).name == "simulated"
