@@ -47,9 +47,11 @@ class Link:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _lose(self, why: str) -> DeviceDisconnected:
+    def _lose(
+        self, why: str, *, cure: str = "check cable and power, then reconnect"
+    ) -> DeviceDisconnected:
         self._state = LinkState.LOST
-        return DeviceDisconnected(self._name, f"{why}; check cable and power, then reconnect")
+        return DeviceDisconnected(self._name, f"{why}; {cure}")
 
     def _need_link(self) -> None:
         if self._state is LinkState.LOST:

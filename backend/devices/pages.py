@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 SECOND_PAGE = 4009
 """Close code of a page that came second."""
@@ -28,12 +28,12 @@ NOT_OURS = 4008
 class Geometry(BaseModel):
     """Where a page is and how it draws, in its own words."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
     width_px: int
     """Device pixels of the window's content."""
     height_px: int
-    ratio: float
+    ratio: float = Field(gt=0)
     """Device pixels per CSS pixel."""
     scale: float = 1.0
     """Pinch zoom."""
@@ -83,6 +83,7 @@ class Page:
         self._connection = connection
         self._changed = threading.Condition()
         self._geometry: Geometry | None = None
+        self._asked = 0
         self._replies: dict[int, Reply] = {}
         self._gone = False
 
@@ -102,6 +103,18 @@ class Page:
         if pixels is not None:
             self._connection.send_bytes(pixels)
 
+    def ask(self, message: Mapping[str, Any]) -> int:
+        """Send a request that is answered, and return its number.
+
+        The page counts, not whoever asks: a page outlives its drivers, and a late answer to one driver
+        must not pass for an answer to the next.
+        """
+        with self._changed:
+            self._asked += 1
+            number = self._asked
+        self.send({**message, "id": number})
+        return number
+
     def wait_for_geometry(self, timeout_s: float) -> Geometry | None:
         """Wait until the page has told where it is."""
         with self._changed:
@@ -112,7 +125,10 @@ class Page:
         """Wait for the answer to a request; None if none came, or the page is gone."""
         with self._changed:
             self._changed.wait_for(lambda: request_id in self._replies or self._gone, timeout_s)
-            return self._replies.pop(request_id, None)
+            reply = self._replies.get(request_id)
+            # Answers to earlier requests came too late for whoever waited.
+            self._replies = {n: r for n, r in self._replies.items() if n > request_id}
+            return reply
 
     def told(self, text: str) -> None:
         """Take what the page says; what isn't ours closes it."""

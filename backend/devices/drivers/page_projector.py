@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
+from pydantic import Field
 
 from backend.devices.errors import (
     DeviceDisconnected,
@@ -37,8 +38,8 @@ class PageOptions(DeviceOptions):
     """Width and height of the projector in [px]: what the page shows is never scaled."""
     page: str = "projector"
     """Name in the page's address."""
-    refresh_hz: float | None = 60.0
-    settle_ms: float | None = None
+    refresh_hz: float | None = Field(60.0, gt=0)
+    settle_ms: float | None = Field(None, ge=0, le=10_000)
     """From the acknowledgement to the light, as the latency calibration found it; None: not measured yet."""
 
 
@@ -62,7 +63,6 @@ class PageProjector(Link):
         self._page: Page | None = None
         self._place: tuple[float, float, str] | None = None
         self._patterns: list[UInt8[np.ndarray, "h w"]] = []
-        self._request = 0
         self._stop = threading.Event()
         self.settle_ms = options.settle_ms
 
@@ -107,9 +107,11 @@ class PageProjector(Link):
             try:
                 self.open()
                 return
-            except (DeviceNotFound, DeviceTimeout) as error:
+            except (DeviceNotFound, DeviceTimeout, DeviceDisconnected) as error:
                 if time.monotonic() > deadline_s:
-                    raise self._lose(f"the page didn't come back within {timeout_s:g} s") from error
+                    raise self._lose_page(
+                        f"the projector page didn't come back within {timeout_s:g} s"
+                    ) from error
 
     def load(self, patterns: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
         """Send patterns to the page, so that showing them needs no network."""
@@ -149,9 +151,7 @@ class PageProjector(Link):
 
     def _asked(self, message: dict[str, object], index: int, timeout_s: float) -> Presented:
         page = self._connected()
-        self._request += 1
-        page.send({**message, "id": self._request})
-        reply = page.wait_for_reply(self._request, timeout_s)
+        reply = page.wait_for_reply(page.ask(message), timeout_s)
         if reply is None:
             raise self._silent(page, timeout_s)
         if reply.code:
@@ -162,12 +162,12 @@ class PageProjector(Link):
 
     def _connected(self) -> Page:
         if self._page is None or self._page.gone:
-            raise self._lose("the projector page was closed or reloaded")
+            raise self._lose_page("the projector page was closed or reloaded")
         return self._page
 
     def _silent(self, page: Page, timeout_s: float) -> DeviceError:
         if page.gone:
-            return self._lose("the projector page was closed or reloaded")
+            return self._lose_page("the projector page was closed or reloaded")
         if page.geometry is not None and not page.geometry.visible:
             return GeometryError(
                 self.name, "the projector page is hidden; bring it to the front of its monitor"
@@ -178,8 +178,11 @@ class PageProjector(Link):
 
     def _refused(self, code: str) -> DeviceError:
         if code == "no-slot":  # a page that was reloaded has forgotten its patterns
-            return self._lose("the projector page has lost its patterns")
-        return DeviceDisconnected(self.name, f"the projector page failed ({code}); reload it")
+            return self._lose_page("the projector page has lost its patterns")
+        return self._lose_page(f"the projector page failed ({code})")
+
+    def _lose_page(self, why: str) -> DeviceDisconnected:
+        return self._lose(why, cure="open it full screen again, then reconnect")
 
     def _refuse_moved(self, page: Page) -> None:
         geometry = page.geometry

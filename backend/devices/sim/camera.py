@@ -295,7 +295,7 @@ class SimulatedCamera(SimulatedLink):
             raise DeviceTimeout(self.name, "waiting for a frame was aborted; arm again")
         reason = self._faults.disconnects(exposure.frame_id)
         if reason:
-            raise self._lose(reason, for_good=self._config.fail_for_good)
+            raise self._lose_cable(reason, for_good=self._config.fail_for_good)
         if self._faults.hangs(exposure.frame_id):
             self._clock.wait_until(self._clock.now_s() + timeout_s, self._aborted)
             raise DeviceTimeout(

@@ -31,6 +31,6 @@ class SimulatedLink(Link):
         self.close()
         self.open()
 
-    def _lose(self, why: str, *, for_good: bool = False) -> DeviceDisconnected:
+    def _lose_cable(self, why: str, *, for_good: bool) -> DeviceDisconnected:
         self._gone_for_good = for_good
-        return super()._lose(why)
+        return self._lose(why)

@@ -98,7 +98,7 @@ class SimulatedProjector(Display):
         limit = self._config.projector_fail_after_shows
         if limit is not None and self._shows >= limit and not self._failed:
             self._failed = True
-            raise self._lose(
+            raise self._lose_cable(
                 f"no answer after {self._shows} patterns", for_good=self._config.fail_for_good
             )
         self._shows += 1

@@ -74,7 +74,9 @@ class SimulatedScreen(Display):
     def _present(self, pattern: UInt8[np.ndarray, "h w"], index: int) -> Presented:
         if self._fail_after is not None and self._shows >= self._fail_after:
             after, self._fail_after = self._fail_after, None
-            raise self._lose(f"no answer after {after} patterns", for_good=self._fail_for_good)
+            raise self._lose_cable(
+                f"no answer after {after} patterns", for_good=self._fail_for_good
+            )
         self._shows += 1
         since_s = math.ceil(self._clock.now_s() / self._period_s) * self._period_s
         self.shown = Lit(pattern, self.shown.number + 1, self.shown.pattern, since_s)

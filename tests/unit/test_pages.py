@@ -1,0 +1,123 @@
+"""Projector pages: what drivers ask of them, what they answer, and in time or not."""
+
+import json
+import threading
+
+import numpy as np
+import pytest
+
+from backend.devices.drivers.page_projector import PageOptions, PageProjector
+from backend.devices.errors import DeviceDisconnected, DeviceTimeout, GeometryError, RigConfigError
+from backend.devices.options import read_options
+from backend.devices.pages import NOT_OURS, Page, PageDesk
+from backend.devices.protocols import LinkState
+
+GEOMETRY = {"width_px": 64, "height_px": 48, "ratio": 1.0}
+
+
+class Browser:
+    """The other side of a page's connection: acknowledges at once, if it isn't told otherwise."""
+
+    def __init__(self, desk: PageDesk, *, answers: bool = True) -> None:
+        self.answers = answers
+        self.code = ""
+        self.geometry: dict[str, float] = GEOMETRY
+        self.asked: list[int] = []
+        self.loaded = 0
+        self.closed: int | None = None
+        page = desk.join("projector", self)
+        assert page is not None
+        self.page: Page = page
+        self.page.told(json.dumps({"t": "geometry", **GEOMETRY}))
+
+    def send_text(self, text: str) -> None:
+        message = json.loads(text)
+        if "id" in message:
+            self.asked.append(message["id"])
+            if self.answers:
+                self.answer(message["id"])
+
+    def send_bytes(self, data: bytes) -> None:
+        self.loaded += 1
+
+    def close(self, code: int, reason: str) -> None:
+        self.closed = code
+
+    def answer(self, number: int) -> None:
+        kind = {"t": "error", "code": self.code} if self.code else {"t": "ack"}
+        self.page.told(json.dumps({**kind, "id": number, "geometry": self.geometry}))
+
+
+@pytest.fixture
+def desk() -> PageDesk:
+    return PageDesk()
+
+
+def opened(desk: PageDesk) -> PageProjector:
+    projector = PageProjector("projector", PageOptions(size=(64, 48), settle_ms=0.0), desk)
+    projector.open()
+    return projector
+
+
+def test_a_late_answer_is_not_taken_for_the_next_drivers(desk: PageDesk) -> None:
+    browser = Browser(desk, answers=False)
+    first = opened(desk)
+    first.load([np.zeros((48, 64), np.uint8)])
+    with pytest.raises(DeviceTimeout, match="didn't draw"):
+        first.show(0, timeout_s=0.01)
+    first.close()
+    second = opened(desk)
+    second.load([np.zeros((48, 64), np.uint8)])
+    browser.answer(browser.asked[0])
+    with pytest.raises(DeviceTimeout, match="didn't draw"):
+        second.show(0, timeout_s=0.01)
+
+
+def test_a_lost_page_is_opened_again_and_gets_its_patterns(desk: PageDesk) -> None:
+    browser = Browser(desk)
+    projector = opened(desk)
+    projector.load([np.zeros((48, 64), np.uint8)])
+    browser.page.left()
+    with pytest.raises(DeviceDisconnected, match="closed or reloaded; open it full screen again"):
+        projector.show(0)
+    assert projector.state is LinkState.LOST
+    threading.Timer(0.05, Browser, (desk,)).start()
+    projector.reconnect()
+    assert projector.show(0).index == 0
+
+
+def test_a_page_that_fails_is_lost(desk: PageDesk) -> None:
+    browser = Browser(desk)
+    projector = opened(desk)
+    browser.code = "no-canvas"
+    with pytest.raises(DeviceDisconnected, match=r"failed \(no-canvas\)"):
+        projector.blank()
+    assert projector.state is LinkState.LOST
+
+
+def test_a_window_that_was_moved_is_refused_until_it_is_taken_anew(desk: PageDesk) -> None:
+    browser = Browser(desk)
+    projector = opened(desk)
+    browser.geometry = {**GEOMETRY, "screen_x": 1920.0}
+    with pytest.raises(GeometryError, match=r"moved to another place or screen \(x 1920, y 0\)"):
+        projector.blank()
+    assert projector.state is LinkState.LOST
+    projector.reconnect()
+    assert projector.blank(9).index == -1
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"t": "geometry", "width_px": 1}', '{"t": "ack"}',
+             '{"t": "geometry", "width_px": 64, "height_px": 48, "ratio": NaN}'],
+)  # fmt: skip
+def test_what_no_page_of_ours_says_closes_it(text: str, desk: PageDesk) -> None:
+    browser = Browser(desk)
+    browser.page.told(text)
+    assert browser.closed == NOT_OURS
+
+
+@pytest.mark.parametrize("options", [{"refresh_hz": -60}, {"settle_ms": -1}, {"refresh_hz": 0}])
+def test_rates_and_times_that_cant_be_are_refused(options: dict[str, float]) -> None:
+    name, value = next(iter(options.items()))
+    with pytest.raises(RigConfigError, match=f"option {name} can't be {value}"):
+        read_options(PageOptions, "projector", {"size": "64x48", **options})
