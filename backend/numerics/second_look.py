@@ -11,6 +11,9 @@ from backend.numerics.code_certainty import PairGeometry
 
 _MOST_PIXELS = 8000
 _STEP_PX = 1.5
+_PULL_PX = 1.2
+"""How far light from elsewhere pulls an edge per share of the light: the largest value of the filter that finds the
+edge, z exp(-z^2 / 2) = 0.61 with z in units of 2 px."""
 
 
 def possible_places(
@@ -104,3 +107,34 @@ def second_light(
     light = white - black
     other = np.where(white - alone > np.float32(noise_gray), white - alone, np.float32(0))
     return np.asarray(other / np.maximum(light, np.float32(noise_gray)), np.float32)
+
+
+def pulled_sigma(
+    sigma_px: Float32[np.ndarray, "h w"],
+    share: Float32[np.ndarray, "h w"],
+    marked: Bool[np.ndarray, "h w"],
+) -> Float32[np.ndarray, "h w"]:
+    r"""Return how well a column is known where part of the light comes from elsewhere.
+
+    Parameters
+    ----------
+    sigma_px
+        Standard deviation by noise, in projector [px].
+    share
+        Of the light that comes from elsewhere, see `second_light`; NaN: not known, taken for none.
+    marked
+        Pixels whose share is more than the glare of lenses and the blur of the bands make up: those pull no edges.
+
+    Notes
+    -----
+    Light at a distance d pulls the edge by up to :math:`share \cdot d \, e^{-d^2 / (2 \tau^2)}`,
+    :math:`\tau` = 2 px being the width of the filter that finds it (`line_shift`): 1.2 px per share at most.
+
+    Examples
+    --------
+    >>> share = np.float32([[0.02, 0.5]])
+    >>> pulled_sigma(np.full_like(share, 0.03), share, share > 0.06).round(2)
+    array([[0.03, 0.6 ]], dtype=float32)
+    """
+    pull_px = np.float32(_PULL_PX) * np.where(marked, np.nan_to_num(share), np.float32(0))
+    return np.asarray(np.hypot(sigma_px, pull_px), np.float32)

@@ -13,7 +13,7 @@ from backend.domain.hints import Frames, Mask, Picture, Value
 from backend.domain.params import setting
 from backend.domain.patterns import WHITE, Gray, Pattern, Stripe
 from backend.domain.rig import RigCalibration, RigFacts
-from backend.domain.shots import Burst, Plan, Shoot, Shot
+from backend.domain.shots import Burst, Exposed, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Level, Review
 from backend.numerics.code_certainty import PairGeometry, on_epipolar_line
@@ -28,6 +28,7 @@ from backend.stages.code_joining import join
 from backend.stages.code_map import least_contrast_gray, require_projector
 from backend.stages.edges import Codes, EdgesParams, edges
 from backend.stages.intensity_mask import IntensityMask
+from backend.stages.pre_exposure import ExposureGrid
 from backend.stages.rig_geometry import camera_geometry
 
 _DEPTH_MARGIN_MM = 15.0
@@ -58,10 +59,16 @@ class SecondLookParams(EdgesParams):
     """Share of its light from which a pixel is looked at again: it moves stripe edges."""
     epipolar_px: float = setting(2.5, title="Row against epipolar line", unit="px", gt=0, le=1000)
     """A code that misses its epipolar line by more came by a second reflection."""
-    bands: int = setting(12, title="Looks", ge=2, le=32)
-    """Each lights one of so many bands of epipolar lines, and takes a picture of every column pattern."""
-    band_px: float = setting(6.0, title="Width of a band", unit="px", ge=2, le=200)
+    bands: int = setting(32, title="Looks", ge=2, le=64)
+    """Each lights one of so many bands of epipolar lines, and takes a picture of every column pattern. The
+    gaps between a look's bands grow with their number."""
+    band_px: float = setting(3.0, title="Width of a band", unit="px", ge=2, le=200)
     """In projector pixels. Narrow bands part places that are near each other, as in a corner."""
+    exposure_ms: float | None = setting(
+        None, title="Exposure", unit="ms", gt=0, auto="exposure_ms", advanced=True
+    )
+    """Automatic: as long as half of the pixels looked at need for the brightness that is aimed at, with the
+    projector at its brightest for them."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,8 @@ class SecondLook:
         Mapping[str, Float32[np.ndarray, "_h _w"]],
         Picture("Light from other places", low=0.0, high=1.0, colormap="inferno"),
     ]
-    """Share of each pixel's light that doesn't come along its own epipolar lines."""
+    """Share of each pixel's light that doesn't come along its own epipolar lines; NaN where a second camera doesn't
+    know which those are."""
     before_share: Annotated[float, Value("Lit pixels untold or lit from two places")]
     after_share: Annotated[float, Value("After the second look")]
     looks: Annotated[int, Value("Looks taken")] = 0
@@ -84,6 +92,7 @@ class SecondLook:
     trusted: Mapping[str, Bool[np.ndarray, "_h _w"]] = field(default_factory=dict)
     """Pixels whose second code is to be used."""
     frames: Annotated[tuple[Frame, ...], Frames("Code of the second look")] = ()
+    exposure_ms: Annotated[float, Value("Exposure of the looks", unit="ms")] = float("nan")
 
 
 def _told(result: SecondLook, params: SecondLookParams) -> Check:
@@ -93,7 +102,7 @@ def _told(result: SecondLook, params: SecondLookParams) -> Check:
     return Check("told", Level.OK, sentence, result.after_share, params.few)
 
 
-@stage(title="Second look", version=1, review=Review.ON_WARNING, checks=(_told,))
+@stage(title="Second look", version=2, review=Review.ON_WARNING, checks=(_told,))
 def second_look(
     codes: Codes,
     frames: CodeFrames,
@@ -125,7 +134,10 @@ def _allowed(mask: IntensityMask | None, params: SecondLookParams) -> bool:
 
 
 class _Look:
-    """Everything that the plan of a second look needs: it is taken with the reference camera."""
+    """Everything that the plan of a second look needs: it is taken with the reference camera.
+
+    Other cameras only see the white fields: which of their pixels get light from two places.
+    """
 
     def __init__(
         self,
@@ -141,19 +153,16 @@ class _Look:
         self.codes, self.mask, self.base, self.facts = codes, mask, base, facts
         self.params = params
         self.projector = require_projector(facts)
-        pair = camera_geometry(calibration, (self.name,)).get(self.name)
+        pairs = camera_geometry(calibration, _coded(codes, facts, calibration))
+        pair = pairs.get(self.name)
         self.patterns = _column_patterns(frames)
-        self.possible = (
-            pair is not None
-            and bool(self.patterns)
-            and self.name in codes.projector_row_px
-            and self.name in codes.projector_px
-        )
+        self.possible = pair is not None and bool(self.patterns)
         if pair is None or not self.possible:
             return
         self.pair: PairGeometry = pair
         self.lines: EpipolarLines = epipolar_lines(*pair)
         self.looks = Looks(params.band_px, params.bands)
+        self.line_px = {name: self._lines_of(name, pairs[name]) for name in pairs}
         self.own: Int32[np.ndarray, "h w"] = self.looks.own(self.lines.camera_px)
         self.told = (codes.reasons[self.name] == 0) & on_epipolar_line(
             codes.projector_px[self.name],
@@ -162,40 +171,55 @@ class _Look:
             tolerance_px=params.epipolar_px,
         )
 
+    def _lines_of(self, name: str, pair: PairGeometry) -> Float32[np.ndarray, "_h _w"]:
+        """Return which of the reference camera's lines lights each pixel: another camera knows by its code alone."""
+        if name == self.name:
+            return self.lines.camera_px
+        columns = self.codes.projector_px[name]
+        points_mm = triangulate_projector(columns, *pair).points_mm
+        return light_at(self.lines.projector_px, columns, _rows(points_mm, pair))
+
     def plan(self) -> Plan[SecondLook]:
         """See who gets light from elsewhere, then code the lines of those, some at a time."""
         whites = yield self._whites()
-        grays = [shot[self.name].gray.astype(np.float32) for shot in whites]
-        alone = self._alone(grays)
-        elsewhere = self._second_light(grays[0], alone)
+        alone = self._alone(self.name, whites)
+        second = {n: self._second_light(n, whites[0], self._alone(n, whites)) for n in self.line_px}
         lit = self.base.lit[self.name]
-        wanted = lit & (~self.told | (elsewhere > self.params.second_light))
+        wanted = lit & (~self.told | (second[self.name] > self.params.second_light))
         if int(np.count_nonzero(wanted)) <= self.params.few * max(1, int(np.count_nonzero(lit))):
-            return self._result(elsewhere, wanted, [], ())
+            return self._result(second, wanted, [], (), float("nan"))
         found: list[_Told] = []
         kept: list[Frame] = []
         depths_mm = self._depths_mm()
-        raised = self._raised(alone, wanted)
+        raised, exposure_ms = self._exposed(self._raised(alone, wanted), wanted)
         for number in range(self.params.bands):
             pixels = wanted & (self.own == number)
             factor = self._factor(number, raised, pixels, depths_mm)
             if not factor.any():
                 continue
-            exposed = yield tuple(self._shot(pattern, factor) for pattern in self.patterns)
+            exposed = yield tuple(
+                self._shot(pattern, factor, exposure_ms, (self.name,)) for pattern in self.patterns
+            )
             frames = code_frames(tuple(shot[self.name] for shot in exposed))
             codes = edges(frames, IntensityMask(factor), self.facts, self.params, _silent)
             found.append(self._told_now(codes, pixels, depths_mm))
             kept += frames.frames
-        return self._result(elsewhere, wanted, found, tuple(kept))
+        return self._result(second, wanted, found, tuple(kept), exposure_ms)
 
     # what is captured
 
-    def _shot(self, pattern: Pattern, factor: Float32[np.ndarray, "h w"]) -> Shot:
+    def _shot(
+        self,
+        pattern: Pattern,
+        factor: Float32[np.ndarray, "h w"],
+        exposure_ms: float,
+        cameras: tuple[str, ...],
+    ) -> Shot:
         return Shot(
             pattern,
-            self.base.exposure_ms,
+            exposure_ms,
             self.base.gain_db,
-            (self.name,),
+            cameras,
             role="second look",
             mask=InMemory(factor),
         )
@@ -207,19 +231,48 @@ class _Look:
             np.where(self.looks.lit(self.lines.projector_px, n, _MARGIN_PX), factor, np.float32(0))
             for n in range(self.params.bands)
         ]
-        return tuple(self._shot(WHITE, part) for part in (factor, *parts))
+        cameras = tuple(self.line_px)
+        return tuple(
+            self._shot(WHITE, part, self.base.exposure_ms, cameras) for part in (factor, *parts)
+        )
 
-    def _alone(self, grays: list[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, "h w"]:
-        """Return every pixel under the look that lights its own lines."""
-        own = np.select([self.own == n for n in range(self.params.bands)], grays[1:])
-        return np.asarray(own, np.float32)
+    def _alone(self, name: str, whites: tuple[Exposed, ...]) -> Float32[np.ndarray, "h w"]:
+        """Return every pixel under the look that lights its own lines; NaN where those aren't known."""
+        line_px = self.line_px[name]
+        own = self.looks.own(line_px)
+        alone = np.full(own.shape, np.nan, np.float32)
+        for number, shot in enumerate(whites[1:]):
+            np.copyto(alone, shot[name].gray, where=own == number, casting="unsafe")
+        return np.where(np.isnan(line_px), np.float32(np.nan), alone)
 
     def _second_light(
-        self, white: Float32[np.ndarray, "h w"], alone: Float32[np.ndarray, "h w"]
+        self, name: str, white: Exposed, alone: Float32[np.ndarray, "h w"]
     ) -> Float32[np.ndarray, "h w"]:
-        noise_gray = least_contrast_gray(self.facts.cameras[self.name])
-        black = self.base.black[self.name].astype(np.float32)
-        return second_light(white, alone, black, noise_gray=noise_gray)
+        noise_gray = least_contrast_gray(self.facts.cameras[name])
+        black = self.base.black[name].astype(np.float32)
+        share = second_light(
+            white[name].gray.astype(np.float32), alone, black, noise_gray=noise_gray
+        )
+        return np.where(np.isnan(alone), np.float32(np.nan), share)
+
+    def _exposed(
+        self, raised: Float32[np.ndarray, "hp wp"], wanted: Bool[np.ndarray, "h w"]
+    ) -> tuple[Float32[np.ndarray, "hp wp"], float]:
+        """Take a shorter exposure and more light instead, where most of the pixels looked at are dimmed anyway."""
+        base_ms = self.base.exposure_ms
+        exposure_ms = self.params.exposure_ms
+        columns, rows = (
+            m.get(self.name) for m in (self.mask.projector_px, self.mask.projector_row_px)
+        )
+        if exposure_ms is None and columns is not None and rows is not None:
+            given = light_at(raised, columns, rows)[wanted]
+            known = given[np.isfinite(given)]
+            share = float(np.median(known)) if known.size else 1.0
+            grid = ExposureGrid.of(self.facts, snap=True)
+            exposure_ms = min(base_ms, grid.ms(grid.index(share * base_ms)))
+        exposure_ms = exposure_ms or base_ms
+        brighter = raised * np.float32(base_ms / exposure_ms)
+        return np.asarray(np.clip(brighter, 0, 1), np.float32), exposure_ms
 
     def _raised(
         self, alone: Float32[np.ndarray, "h w"], wanted: Bool[np.ndarray, "h w"]
@@ -280,22 +333,16 @@ class _Look:
         points_mm = triangulate_projector(columns, *self.pair).points_mm
         with np.errstate(invalid="ignore"):
             inside = (points_mm[..., 2] >= depths_mm[0]) & (points_mm[..., 2] <= depths_mm[1])
-        # The row wasn't coded: the lines that are lit tell it. The residual against row 0 is the row.
-        rows = projector_consistency(
-            points_mm,
-            np.zeros_like(columns),
-            self.pair.projector,
-            self.pair.projector_from_camera,
-            rows=True,
-        )
+        rows = _rows(points_mm, self.pair)
         return _Told(codes, pixels & (codes.reasons[self.name] == 0) & inside, rows)
 
     def _result(
         self,
-        elsewhere: Float32[np.ndarray, "h w"],
+        second: Mapping[str, Float32[np.ndarray, "_h _w"]],
         wanted: Bool[np.ndarray, "h w"],
         found: list["_Told"],
         frames: tuple[Frame, ...],
+        exposure_ms: float,
     ) -> SecondLook:
         told_now = np.zeros(wanted.shape, bool)
         for told in found:
@@ -304,17 +351,25 @@ class _Look:
         marked[wanted] = _UNTOLD
         marked[wanted & self.told] = _SECOND_LIGHT
         marked[told_now] = _TOLD_NOW
+        others = {n: self._marked(n, share) for n, share in second.items() if n != self.name}
         lit = max(1, int(np.count_nonzero(self.base.lit[self.name])))
         return SecondLook(
-            {self.name: marked},
-            {self.name: elsewhere},
+            {self.name: marked, **others},
+            second,
             int(np.count_nonzero(wanted)) / lit,
             int(np.count_nonzero(wanted & ~told_now)) / lit,
             len(found),
             _merged(self.name, found) if found else None,
             {self.name: told_now} if found else {},
             frames,
+            exposure_ms,
         )
+
+    def _marked(self, name: str, share: Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+        """Mark the pixels of a camera that takes no second look."""
+        with np.errstate(invalid="ignore"):
+            is_second = self.base.lit[name] & (share > np.float32(self.params.second_light))
+        return np.where(is_second, np.uint8(_SECOND_LIGHT), np.uint8(0))
 
 
 @dataclass(frozen=True)
@@ -324,6 +379,26 @@ class _Told:
     codes: Codes
     use: Bool[np.ndarray, "h w"]
     row_px: Float32[np.ndarray, "h w"]
+
+
+def _rows(
+    points_mm: Float32[np.ndarray, "h w 3"], pair: PairGeometry
+) -> Float32[np.ndarray, "h w"]:
+    """Return the projector row of each point, finer than a code of rows tells it."""
+    none = np.zeros(points_mm.shape[:2], np.float32)
+    # The residual against row 0 is the row.
+    return projector_consistency(
+        points_mm, none, pair.projector, pair.projector_from_camera, rows=True
+    )
+
+
+def _coded(codes: Codes, facts: RigFacts, calibration: RigCalibration | None) -> tuple[str, ...]:
+    """Name the cameras that read columns and rows, if the reference camera is one of them."""
+    if calibration is None:
+        return ()
+    names = [n for n in codes.projector_px if n in codes.projector_row_px and n in facts.cameras]
+    known = tuple(n for n in names if n in calibration.camera_from_world)
+    return known if facts.reference in known else ()
 
 
 def _column_patterns(frames: CodeFrames) -> tuple[Pattern, ...]:
