@@ -8,6 +8,7 @@ import ctypes
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -58,7 +59,8 @@ _HEARTBEAT_S = 3.0
 """So long a dead client keeps control of a camera."""
 _READOUT_MARGIN_S = 0.004
 _EXPOSURE_NAMES = ("ExposureTime", "ExposureTimeAbs")
-_GAIN_NAMES = ("Gain", "GainRaw")
+_GAIN_NAMES = ("Gain", "GainAbs")
+"""In dB; a raw gain has steps of its own and stays as it is."""
 
 
 _UNKNOWN = CameraCapabilities((0, 0), (), Range(0, 0), Range(0, 0), ())
@@ -100,6 +102,8 @@ class AravisCamera(Link):
         self._stream = _Handle()
         self._lost_callback: object = None
         self._aborted = threading.Event()
+        self._stopping = threading.Lock()
+        """`abort` may come from any thread, also while the camera is given back."""
         self._capabilities = _UNKNOWN
         self._settings = CameraSettings(0.0)
         self._wanted: CameraSettings | None = None
@@ -115,6 +119,7 @@ class AravisCamera(Link):
         if self._state in (LinkState.READY, LinkState.ARMED):
             return
         library = self._library()
+        self._drop()  # what a lost connection left behind
         self._camera.value = self._connected(library)
         try:
             library.plain("arv_camera_set_range_check_policy", self._camera.value, _RANGE_CHECKED)
@@ -135,13 +140,16 @@ class AravisCamera(Link):
     def close(self) -> None:
         """Give the camera back; whoever waits for a frame stops waiting."""
         self._aborted.set()
+        with suppress(DeviceError):  # a camera that is gone streams no more either
+            self.disarm()
         self._drop()
         self._state = LinkState.CLOSED
 
     def reconnect(self, timeout_s: float = 10.0) -> None:
         """Open again, with the settings of before; a former owner's heartbeat may have to end first."""
         wanted = self._wanted
-        deadline_s = time.monotonic() + max(timeout_s, 2 * _HEARTBEAT_S)
+        patience_s = max(timeout_s, 2 * _HEARTBEAT_S)
+        deadline_s = time.monotonic() + patience_s
         while True:
             self.close()
             try:
@@ -150,7 +158,7 @@ class AravisCamera(Link):
             except (DeviceBusy, DeviceNotFound, DeviceTimeout, DeviceDisconnected) as error:
                 if time.monotonic() > deadline_s:
                     raise self._lose(
-                        f"doesn't come back within {timeout_s:g} s ({error})"
+                        f"doesn't come back within {patience_s:g} s ({error})"
                     ) from error
                 time.sleep(0.25)
         if wanted is not None:
@@ -200,10 +208,11 @@ class AravisCamera(Link):
             self._state = LinkState.LOST
 
     def _drop(self) -> None:
-        for handle in (self._stream, self._camera):
-            if handle.value:
-                aravis().plain("g_object_unref", handle.value)
-                handle.value = 0
+        with self._stopping:
+            for handle in (self._stream, self._camera):
+                if handle.value:
+                    aravis().plain("g_object_unref", handle.value)
+                    handle.value = 0
         self._buffers = 0
 
     # ------------------------------------------------------------ what it is
@@ -449,6 +458,7 @@ class AravisCamera(Link):
 
     def _popped(self, wait_s: float) -> int:
         if not self._stream.value:
+            self._aborted.wait(wait_s)  # never armed: nothing comes
             return 0
         slice_us = max(1, int(wait_s * 1e6))
         buffer = aravis().plain("arv_stream_timeout_pop_buffer", self._stream.value, slice_us)
@@ -479,8 +489,13 @@ class AravisCamera(Link):
         width_px, height_px = (
             int(library.plain(f"arv_buffer_get_image_{n}", buffer)) for n in ("width", "height")
         )
+        data = _pixels(buffer, height_px, width_px, pixel_format)
+        if data is None:
+            raise IncompleteFrame(
+                self.name, f"frame {number} is too short for {width_px}x{height_px} {pixel_format}; take it again"
+            )  # fmt: skip
         return Frame(
-            data=_pixels(buffer, height_px, width_px, pixel_format),
+            data=data,
             pixel_format=pixel_format,
             bits=_BITS[pixel_format],
             frame_id=number,
@@ -492,19 +507,19 @@ class AravisCamera(Link):
 
     def disarm(self) -> None:
         """Stop acquisition."""
-        if self._state is not LinkState.ARMED:
-            return
-        self._state = LinkState.READY
-        try:
-            self._call("arv_camera_stop_acquisition")
-        except AravisError as error:
-            raise self._translated(error, "disarming") from error
+        with self._stopping:
+            if self._state is not LinkState.ARMED:
+                return
+            self._state = LinkState.READY
+            try:
+                self._call("arv_camera_stop_acquisition")
+            except AravisError as error:
+                raise self._translated(error, "disarming") from error
 
     def abort(self) -> None:
         """Stop waiting; acquisition is ended by whoever waits or arms next. Thread-safe."""
         self._aborted.set()
-        if self._state is LinkState.ARMED:
-            self.disarm()
+        self.disarm()
 
     # ------------------------------------------------------------ errors
 
@@ -555,10 +570,13 @@ class _FrameCounter:
 
 def _pixels(
     buffer: int, height_px: int, width_px: int, pixel_format: str
-) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
+) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"] | None:
+    """Copy the pixels out of a buffer; None if it holds fewer."""
     size = ctypes.c_size_t()
     address = aravis().plain("arv_buffer_get_data", buffer, ctypes.byref(size))
     dtype = np.dtype(np.uint8) if pixel_format == "Mono8" else np.dtype("<u2")
-    count = height_px * width_px
-    data = ctypes.string_at(address, count * dtype.itemsize)
+    count_bytes = height_px * width_px * dtype.itemsize
+    if not address or size.value < count_bytes:
+        return None
+    data = ctypes.string_at(address, count_bytes)
     return np.frombuffer(bytearray(data), dtype).reshape(height_px, width_px)
