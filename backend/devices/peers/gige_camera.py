@@ -4,6 +4,7 @@ The simulated rig's cameras, served like this, let real drivers be used and test
 privileges are needed: UDP port 3956 is open to everybody, and 127.0.0.0/8 has an address for each camera.
 """
 
+import contextlib
 import logging
 import random
 import socket
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from backend.devices.errors import DeviceError, DeviceTimeout, FeatureError
+from backend.devices.errors import DeviceDisconnected, DeviceError, DeviceTimeout, FeatureError
 from backend.devices.peers import genicam as features
 from backend.devices.peers.gvcp import (
     DISCOVERY_BYTES,
@@ -97,19 +98,21 @@ class GigECamera:
         ------
         OSError
             If the address isn't this machine's, or another camera has it.
+        DeviceError
+            If the served camera can't be opened.
         """
         self._control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._control.bind((self._address, PORT))
             self._stream.bind((self._address, 0))
-        except OSError:
+            self._stream.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 << 20)
+            self._control.settimeout(_POLL_S)
+            self._camera.open()
+            self._describe()
+        except BaseException:
             self._close_sockets()
             raise
-        self._stream.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 << 20)
-        self._control.settimeout(_POLL_S)
-        self._camera.open()
-        self._describe()
         self._ending.clear()
         for work in (self._answer_commands, self._send_frames):
             thread = threading.Thread(
@@ -125,6 +128,7 @@ class GigECamera:
         for thread in self._threads:
             thread.join()
         self._threads.clear()
+        self._release()  # after a restart nobody controls it
         self._close_sockets()
         self._camera.close()
 
@@ -261,12 +265,23 @@ class GigECamera:
             asked = parse_request(packet)
             if asked is None:
                 continue
-            try:
-                reply = answer(asked, self._carry_out(asked, client))
-            except RefusedError as refusal:
-                reply = answer(asked, b"", refusal.status)
+            reply = self._reply(asked, client)
             if asked.wants_answer:
-                self._control.sendto(reply, client)
+                with contextlib.suppress(OSError):  # a client that can't be reached any more
+                    self._control.sendto(reply, client)
+
+    def _reply(self, asked: Request, client: tuple[str, int]) -> bytes:
+        """Carry out a command, or say why not: whatever anybody sends, the camera goes on answering."""
+        try:
+            return answer(asked, self._carry_out(asked, client))
+        except RefusedError as refusal:
+            status = refusal.status
+        except (struct.error, ValueError):  # a payload of the wrong length
+            status = Status.INVALID_PARAMETER
+        except DeviceError as error:
+            log.warning("A command isn't carried out: %s", error)
+            status = Status.ERROR
+        return answer(asked, b"", status)
 
     def _notice_silence(self) -> None:
         """Take control back from a client that died: its heartbeat has stopped."""
@@ -354,6 +369,10 @@ class GigECamera:
             try:
                 frame = self._camera.get_frame(timeout_s=_POLL_S)
             except DeviceTimeout:
+                continue
+            except DeviceDisconnected as error:
+                log.warning("No frame is sent any more: %s", error)
+                self._acquiring.clear()
                 continue
             except DeviceError as error:
                 log.warning("No frame is sent: %s", error)

@@ -38,6 +38,7 @@ class Status(IntEnum):
     BAD_ALIGNMENT = 0x8005
     ACCESS_DENIED = 0x8006
     BUSY = 0x8007
+    ERROR = 0x8FFF
 
 
 class RefusedError(Exception):
