@@ -189,6 +189,11 @@ def test_a_second_look_tells_what_second_reflections_had_spoilt():
         look = second_look(codes, frames, mask, base, facts, calibration, params, shoot)
     found = Masked(shoot, base, mask)
     assert look.looks == 6
+    # Most of what is looked at again had been dimmed: less time and more light instead, in whole projector frames.
+    assert look.exposure_ms < 0.7 * base.exposure_ms
+    frame_ms = facts.projector.frame_period_ms
+    assert look.exposure_ms / frame_ms == pytest.approx(round(look.exposure_ms / frame_ms))
+    assert {f.exposure_ms for f in look.frames} == {look.exposure_ms}
     assert look.after_share < 0.5 * look.before_share
     joined = joined_codes(codes, look)
     truth = found.truth
