@@ -52,7 +52,7 @@ def make_projector(name: str, driver: str, options: Mapping[str, Any], desk: Pag
 
 def available_drivers(group: str) -> tuple[str, ...]:
     """Return the drivers of `CAMERAS` or `PROJECTORS` that have a name; nothing is imported."""
-    return (*_BUILT_IN[group], *sorted(_entries(group)))
+    return (*_BUILT_IN[group], *sorted(_entries(group).keys() - _BUILT_IN[group].keys()))
 
 
 def _made(group: str, name: str, driver: str, options: Mapping[str, Any], **more: object) -> Any:

@@ -10,6 +10,7 @@
 The first camera is the reference. What a driver needs besides (`address` above) is its own matter.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,12 @@ from backend.devices.driver_loading import make_camera, make_projector
 from backend.devices.errors import RigConfigError
 from backend.devices.pages import PageDesk
 from backend.domain.rig import PinholeModel, Pose, RigCalibration
+from backend.numerics.pinhole import DISTORTION_SIZES
 
 _Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+_CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,40}")
 
 
 class _Part(BaseModel):
@@ -74,6 +79,14 @@ class ViewEntry(_Part):
         R = np.array(value)
         if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
             raise ValueError("it is no rotation: its rows have to be orthonormal and right-handed")
+        return value
+
+    @field_validator("distortion")
+    @classmethod
+    def _of_opencv(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if len(value) not in DISTORTION_SIZES:
+            known = ", ".join(map(str, DISTORTION_SIZES))
+            raise ValueError(f"it has {len(value)} coefficients, OpenCV's sets have {known}")
         return value
 
     @property
@@ -143,6 +156,16 @@ class RigFile(_Part):
         """Name of the projector page that shows its patterns; None where no page does."""
         options = self.projector.model_extra or {}
         return str(options.get("page", "projector")) if self.projector.driver == "page" else None
+
+    @field_validator("cameras")
+    @classmethod
+    def _named_for_files(cls, value: dict[str, CameraEntry]) -> dict[str, CameraEntry]:
+        for name in value:
+            if not _CAMERA_NAME.fullmatch(name) or name == "projector":
+                raise ValueError(
+                    f"{name!r} is no name for a camera: use letters, digits, dashes and underscores, and not `projector`"
+                )
+        return value
 
     @model_validator(mode="after")
     def _no_strangers(self) -> "RigFile":

@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from backend.numerics.errors import CalibrationError
 
-_DISTORTION_SIZES = (0, 4, 5, 8, 12, 14)
+DISTORTION_SIZES = (0, 4, 5, 8, 12, 14)
+"""Coefficients in OpenCV's models."""
 
 
 class Pinhole(NamedTuple):
@@ -47,10 +48,10 @@ def check_pinhole(camera: Pinhole, name: str) -> None:
             f"the intrinsic matrix of {name} is {camera.K.tolist()}; it needs positive focal lengths"
             " and the last row 0 0 1"
         )
-    if camera.distortion.size not in _DISTORTION_SIZES:
+    if camera.distortion.size not in DISTORTION_SIZES:
         raise CalibrationError(
             f"{name} has {camera.distortion.size} distortion coefficients; OpenCV's models have"
-            f" {', '.join(map(str, _DISTORTION_SIZES))}"
+            f" {', '.join(map(str, DISTORTION_SIZES))}"
         )
     if camera.width_px < 2 or camera.height_px < 2:
         raise CalibrationError(
