@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, Shaped, UInt8
 
 from backend.domain.checks import Check
 from backend.domain.frames import Frame, InMemory
@@ -24,7 +24,6 @@ from backend.numerics.second_look import Looks, possible_places, second_light
 from backend.numerics.triangulation import projector_consistency, triangulate_projector
 from backend.stages.base_exposure import BaseExposure
 from backend.stages.code_frames import CodeFrames, code_frames
-from backend.stages.code_joining import join
 from backend.stages.code_map import least_contrast_gray, require_projector
 from backend.stages.edges import Codes, EdgesParams, edges
 from backend.stages.intensity_mask import IntensityMask
@@ -187,9 +186,8 @@ class _Look:
         lit = self.base.lit[self.name]
         wanted = lit & (~self.told | (second[self.name] > self.params.second_light))
         if int(np.count_nonzero(wanted)) <= self.params.few * max(1, int(np.count_nonzero(lit))):
-            return self._result(second, wanted, [], (), float("nan"))
-        found: list[_Told] = []
-        kept: list[Frame] = []
+            return self._result(second, wanted)
+        picture = _Composite(self.name, self.patterns, self.own)
         depths_mm = self._depths_mm()
         raised, exposure_ms = self._exposed(self._raised(alone, wanted), wanted)
         for number in range(self.params.bands):
@@ -200,11 +198,12 @@ class _Look:
             exposed = yield tuple(
                 self._shot(pattern, factor, exposure_ms, (self.name,)) for pattern in self.patterns
             )
-            frames = code_frames(tuple(shot[self.name] for shot in exposed))
-            codes = edges(frames, IntensityMask(factor), self.facts, self.params, _silent)
-            found.append(self._told_now(codes, pixels, depths_mm))
-            kept += frames.frames
-        return self._result(second, wanted, found, tuple(kept), exposure_ms)
+            picture.take_in(exposed, number)
+        if not picture.frames:
+            return self._result(second, wanted)
+        codes = edges(picture.code(), IntensityMask(raised), self.facts, self.params, _silent)
+        told = self._told_now(codes, wanted, depths_mm)
+        return self._result(second, wanted, told, picture, exposure_ms)
 
     # what is captured
 
@@ -334,19 +333,18 @@ class _Look:
         with np.errstate(invalid="ignore"):
             inside = (points_mm[..., 2] >= depths_mm[0]) & (points_mm[..., 2] <= depths_mm[1])
         rows = _rows(points_mm, self.pair)
-        return _Told(codes, pixels & (codes.reasons[self.name] == 0) & inside, rows)
+        codes = replace(codes, projector_row_px={self.name: rows})
+        return _Told(codes, pixels & (codes.reasons[self.name] == 0) & inside)
 
     def _result(
         self,
         second: Mapping[str, Float32[np.ndarray, "_h _w"]],
         wanted: Bool[np.ndarray, "h w"],
-        found: list["_Told"],
-        frames: tuple[Frame, ...],
-        exposure_ms: float,
+        told: "_Told | None" = None,
+        picture: "_Composite | None" = None,
+        exposure_ms: float = float("nan"),
     ) -> SecondLook:
-        told_now = np.zeros(wanted.shape, bool)
-        for told in found:
-            told_now |= told.use
+        told_now = np.zeros(wanted.shape, bool) if told is None else told.use
         marked = np.zeros(wanted.shape, np.uint8)
         marked[wanted] = _UNTOLD
         marked[wanted & self.told] = _SECOND_LIGHT
@@ -358,10 +356,10 @@ class _Look:
             second,
             int(np.count_nonzero(wanted)) / lit,
             int(np.count_nonzero(wanted & ~told_now)) / lit,
-            len(found),
-            _merged(self.name, found) if found else None,
-            {self.name: told_now} if found else {},
-            frames,
+            picture.looks if picture else 0,
+            told.codes if told else None,
+            {self.name: told_now} if told else {},
+            tuple(picture.frames) if picture else (),
             exposure_ms,
         )
 
@@ -374,11 +372,43 @@ class _Look:
 
 @dataclass(frozen=True)
 class _Told:
-    """What one look tells."""
+    """What the looks tell together, and about which pixels."""
 
     codes: Codes
     use: Bool[np.ndarray, "h w"]
-    row_px: Float32[np.ndarray, "h w"]
+
+
+class _Composite:
+    """One picture of each pattern, put together from the looks: every pixel as it is when its own lines are lit."""
+
+    def __init__(
+        self, name: str, patterns: tuple[Pattern, ...], own: Int32[np.ndarray, "h w"]
+    ) -> None:
+        self.name, self.patterns, self.own = name, patterns, own
+        self.frames: list[Frame] = []
+        """As they were captured."""
+        self.looks = 0
+        self.grays: list[Shaped[np.ndarray, "h w"]] = []
+
+    def take_in(self, exposed: tuple[Exposed, ...], number: int) -> None:
+        """Take the pixels of a look."""
+        taken = [shot[self.name] for shot in exposed]
+        if not self.looks:
+            self.grays = [np.zeros_like(frame.gray) for frame in taken]
+        for gray, frame in zip(self.grays, taken, strict=True):
+            np.copyto(gray, frame.gray, where=self.own == number)
+        self.frames += taken
+        self.looks += 1
+
+    def code(self) -> CodeFrames:
+        """Return the pictures as if they had been captured so."""
+        first = self.frames[: len(self.patterns)]
+        return code_frames(
+            tuple(
+                replace(frame, pixels=InMemory(gray))
+                for frame, gray in zip(first, self.grays, strict=True)
+            )
+        )
 
 
 def _rows(
@@ -409,14 +439,6 @@ def _column_patterns(frames: CodeFrames) -> tuple[Pattern, ...]:
         for f in frames.frames
         if f.camera == first and isinstance(f.pattern, Gray | Stripe) and f.pattern.axis == "x"
     )
-
-
-def _merged(name: str, found: list[_Told]) -> Codes:
-    """Put together what the looks tell, each about its own pixels."""
-    first, *others = (replace(t.codes, projector_row_px={name: t.row_px}) for t in found)
-    for codes, told in zip(others, found[1:], strict=True):
-        first = join(first, codes, {name: told.use})
-    return first
 
 
 def _silent(done: float, text: str = "") -> None:
