@@ -91,4 +91,4 @@ def test_without_calibration_a_scan_ends_before_the_slopes_and_says_why(scan):
     stages = {s["name"]: s for s in scan("--rig-option", "calibrated=false")["stages"]}
     assert stages["screen_phase"]["status"] == "done"
     assert stages["slopes"]["status"] == "unavailable"
-    assert "RigCalibration" in stages["slopes"]["message"]
+    assert "needs rig calibration" in stages["slopes"]["message"]

@@ -296,6 +296,15 @@ def test_closing_interrupts_and_the_next_start_goes_on(
         assert house.rigs.shots + again.rigs.shots <= 5 + 8 + 1
 
 
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Let SIGINT be what Ctrl+C sends: programs that a shell starts in the background ignore it from birth."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_on_the_command_line_cancels_and_keeps_the_frames(house: House) -> None:
     runner = house.services.context.runner
     assert isinstance(runner, InlineRunner)

@@ -55,6 +55,7 @@ _SUCCESS, _TIMED_OUT = 0, 2  # states of a buffer
 _WRAP = 0xFFFF
 """GigE Vision counts frames from 1 to 65535."""
 _RANGE_CHECKED = 1
+_ORDINARY_SOCKET = 1
 _HEARTBEAT_S = 3.0
 """So long a dead client keeps control of a camera."""
 _READOUT_MARGIN_S = 0.004
@@ -300,6 +301,9 @@ class AravisCamera(Link):
     def _set_packet_size(self, library: Aravis) -> None:
         if not library.plain("arv_camera_is_gv_device", self._camera.value):
             return
+        # An ordinary socket is bound before the first trigger, so that nothing is lost while the receiving
+        # thread starts; and it is the same one with and without privileges.
+        library.plain("arv_camera_gv_set_stream_options", self._camera.value, _ORDINARY_SOCKET)
         if self._options.packet_bytes is None:
             self._call("arv_camera_gv_auto_packet_size")
         else:

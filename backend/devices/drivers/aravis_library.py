@@ -87,6 +87,7 @@ _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_get_device": (_POINTER, (_POINTER,)),
     "arv_camera_is_gv_device": (_BOOL, (_POINTER,)),
     "arv_camera_set_range_check_policy": (None, (_POINTER, _INT)),
+    "arv_camera_gv_set_stream_options": (None, (_POINTER, _INT)),
     "arv_buffer_new_allocate": (_POINTER, (_SIZE,)),
     "arv_buffer_get_status": (_INT, (_POINTER,)),
     "arv_buffer_get_data": (_POINTER, (_POINTER, ctypes.POINTER(_SIZE))),
