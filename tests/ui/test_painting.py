@@ -34,6 +34,12 @@ def wishes(served: Served, what: str) -> list[Any]:
     return [request for _, asked, request in served.services.asked if asked == what]
 
 
+def show(desk: Desk, picture: str) -> None:
+    """Choose a picture of the stage: the page may still show what was looked at last."""
+    desk.page.get_by_role("combobox", name="Show").click()
+    desk.page.get_by_role("option", name=picture).click()
+
+
 def inspect(desk: Desk) -> Locator:
     """Enlarge the first picture; returns the canvas."""
     close = desk.page.locator(".mantine-Notification-closeButton")
@@ -57,6 +63,7 @@ def test_a_stroke_becomes_a_mask_that_the_setting_names(
     served: Served, seat: Seat, scan: Scan
 ) -> None:
     desk = seat().open_scan(scan.name)
+    show(desk, "Intensity mask")
     canvas = inspect(desk)
     mouse = desk.page.mouse
     mouse.move(*place(canvas, 0.4, 0.25))
@@ -79,8 +86,7 @@ def test_a_point_of_a_search_map_is_proposed_and_applied(
     served: Served, seat: Seat, scan: Scan
 ) -> None:
     desk = seat().open_scan(scan.name)
-    desk.page.get_by_role("combobox", name="Show").click()
-    desk.page.get_by_role("option", name="U over darkest").click()
+    show(desk, "U over darkest")
     canvas = inspect(desk)
     desk.page.mouse.click(*place(canvas, 0.15, 0.42))
     expect(desk.page.locator(".ug-setting-note")).to_contain_text("changed, not applied")
