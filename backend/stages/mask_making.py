@@ -1,11 +1,11 @@
 """What the stages that make intensity masks share: settings, and the way from pixels' needs to a mask."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from backend.domain.arrays import ArrayHash, LoadArray
 from backend.domain.checks import Check, at_least
@@ -153,10 +153,3 @@ def not_too_dark(result: IntensityMask, params: MaskParams) -> Check:
         sentence=f"the mask lets {mean:.1%} of the light through on average",
         remedy="it darkens nearly everything: shorten the base exposure or raise the scale",
     )  # fmt: skip
-
-
-def lit_pixels(
-    base: BaseExposure, cameras: Sequence[str]
-) -> Mapping[str, Bool[np.ndarray, "_h _w"]]:
-    """Return the lit pixels of some cameras."""
-    return {name: base.lit[name] for name in cameras}

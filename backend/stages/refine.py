@@ -159,12 +159,13 @@ class _Refinement:
         """Try the mask so far, decode under it, make it anew, correct it by what comes back, try it."""
         rounds = list(self.mask.rounds)
         before = yield from self._try(self.mask.factor)
+        needs = self._response_needs()
+        response_most = _most(needs)
         if not rounds:
             frames = 1 + len(_stripes(self.projector))
-            rounds.append(self._round(_name(self.mask), before, self._response_most(), frames))
+            rounds.append(self._round(_name(self.mask), before, response_most, frames))
         exposures_ms = yield from self._exposures(before)
         maps = yield from code_map_plan(self.facts, self._code_shots(exposures_ms))
-        needs = self._response_needs()
         factor = self._gather(needs, maps)
         for _ in range(self.params.trims):
             (white,) = yield (self._shot(WHITE, factor),)
@@ -176,17 +177,16 @@ class _Refinement:
             factor = self._gather(needs, maps)
         factor = touched_up(factor, self.params, self.load)
         after = yield from self._try(factor)
-        most = {name: need.most for name, need in needs.items()}
         codes = len(exposures_ms) * len(code_patterns(self.projector))
         frames = codes + self.params.trims + 1 + len(_stripes(self.projector))
         name = f"refinement {self.mask.round + 1}"
-        rounds.append(self._round(name, after, self._response_most(), frames))
-        return self._result(factor, after, maps, most, tuple(rounds))
+        rounds.append(self._round(name, after, response_most, frames))
+        return self._result(factor, after, maps, _most(needs), tuple(rounds))
 
     def touch_up_plan(self, factor: Float32[np.ndarray, "h w"]) -> Plan[IntensityMask]:
         """Only try what the operator changed."""
         trial = yield from self._try(factor)
-        most = self._response_most()
+        most = _most(self._response_needs())
         row = self._round("by hand", trial, most, 1 + len(_stripes(self.projector)))
         return replace(
             self.mask,
@@ -273,9 +273,6 @@ class _Refinement:
             )
             for name in self.cameras
         }
-
-    def _response_most(self) -> dict[str, Float32[np.ndarray, "_h _w"]]:
-        return {name: need.most for name, need in self._response_needs().items()}
 
     def _gather(
         self, needs: Mapping[str, Need], maps: Mapping[str, CodeMap]
@@ -370,6 +367,10 @@ class _Refinement:
             dilation_px=self.params.dilation_px,
             mean_factor=float(factor.mean()),
         )
+
+
+def _most(needs: Mapping[str, Need]) -> dict[str, Float32[np.ndarray, "_h _w"]]:
+    return {name: need.most for name, need in needs.items()}
 
 
 def _name(mask: IntensityMask) -> str:
