@@ -64,10 +64,16 @@ def load_scan(repositories: Repositories, registry: Registry, scan: str) -> Load
 
 def load_inputs(repositories: Repositories, planned: PlannedStage) -> dict[str, Document | None]:
     """Read the documents of a stage's inputs."""
-    return {name: _document(repositories, source) for name, source in planned.inputs.items()}
+    return {
+        name: document_of(repositories, source) if source else None
+        for name, source in planned.inputs.items()
+    }
 
 
-def _document(repositories: Repositories, source: GivenRow | RunRow | None) -> Document | None:
-    if isinstance(source, RunRow):
-        return repositories.runs.get(source.id).document
-    return source.document if source else None
+def document_of(repositories: Repositories, result: RunRow | GivenRow) -> Document:
+    """Return a result's document, which plans come without."""
+    if isinstance(result, GivenRow):
+        return result.document
+    document = repositories.runs.get(result.id).document
+    assert document is not None, "a plan's present runs are finished"
+    return document

@@ -14,7 +14,7 @@ from backend.domain.method import Method
 from backend.domain.states import Level, Verdict
 from backend.domain.type_names import words
 from backend.jobs.calibrations import give_calibration, rig_identity
-from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
+from backend.jobs.loading import NO_RIG, LoadedScan, document_of, load_scan
 from backend.jobs.plan import PlannedStage, run_level
 from backend.methods import Registry
 from backend.services.context import Context
@@ -46,8 +46,7 @@ def keep(context: Context, stage_run: str, who: str) -> CalibrationView:
         _refuse_unfit(context.registry, loaded, planned, run)
         identity = rig_identity(loaded.row.rig, loaded.given)
         assert identity is not None, "a stage has run, so the facts are known"
-        document = repositories.runs.get(run.id).document
-        assert document is not None, "a finished run has its result"
+        document = document_of(repositories, run)
         kept = repositories.calibrations.add(
             type_name=planned.stage.output.__name__,
             **identity._asdict(),
@@ -194,12 +193,9 @@ def _result_of_scan(
     for planned in reversed(loaded.plan.stages):
         result = planned.result
         if result is not None and planned.stage.output.__name__ == type_name:
-            document = result.document
-            if isinstance(result, RunRow):
-                document = repositories.runs.get(result.id).document
             sentence = f"From scan {loaded.title!r}, {planned.stage.title}."
             origin = {"sentence": sentence, "scan": scan, "stage": planned.name}
-            return _Found(document or {}, origin)
+            return _Found(document_of(repositories, result), origin)
     for row in loaded.given.values():
         if row.type_name == type_name:
             sentence = f"From scan {loaded.title!r}, which was given it."

@@ -23,7 +23,7 @@ from backend.domain.errors import ConflictError
 from backend.domain.method import Wire
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.shots import Progress
-from backend.jobs.loading import LoadedScan, load_scan
+from backend.jobs.loading import LoadedScan, document_of, load_scan
 from backend.services.context import Context
 from backend.services.export_capture import write_capture
 from backend.services.export_folder import (
@@ -37,7 +37,7 @@ from backend.services.export_folder import (
 from backend.services.handed import takers
 from backend.services.ply import ply_parts
 from backend.services.portable import written_out
-from backend.services.reporting import document_of, load_cloud, report
+from backend.services.reporting import load_cloud, report
 from backend.services.states import scan_state
 from backend.services.telling import announce
 from backend.stages.cloud import Cloud

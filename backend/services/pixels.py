@@ -7,12 +7,11 @@ from backend.contract.scans import PixelLevels
 from backend.domain.errors import ConflictError, NotFoundError
 from backend.domain.hints import Frames
 from backend.domain.stage import shown_fields
-from backend.jobs.loading import load_scan
+from backend.jobs.loading import document_of, load_scan
 from backend.services.context import Context
 from backend.services.editing import find_stage
 from backend.services.previews import value_at
 from backend.storage.artifacts import ArtifactStore
-from backend.storage.rows import RunRow
 
 
 def levels_at(
@@ -33,15 +32,13 @@ def levels_at(
         result = loaded.plan.stage(stage).result
         if result is None:
             raise ConflictError(f"{found.title} has no result now: run it first.")
-        document = result.document
-        if isinstance(result, RunRow):
-            document = repositories.runs.get(result.id).document
+        document = document_of(repositories, result)
     hints = {shown.name: shown.hint for shown in shown_fields(found.output)}
     hint = hints.get(field)
     if not isinstance(hint, Frames):
         named = ", ".join(n for n, h in hints.items() if isinstance(h, Frames)) or "none"
         raise NotFoundError(f"{found.title} has no frames {field!r}; it has {named}.")
-    return _levels(document or {}, field, hint, context.store, camera, x, y)
+    return _levels(document, field, hint, context.store, camera, x, y)
 
 
 def _levels(

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from backend.devices.protocols import KnowsTruth, Rig
 from backend.domain.errors import UnglareError
-from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
+from backend.jobs.loading import NO_RIG, LoadedScan, document_of, load_scan
 from backend.numerics.mirror_scoring import MirrorScore
 from backend.numerics.reasons import Reason
 from backend.numerics.scoring import DEFINITION, Score, Scores, Truth, point_errors, score
@@ -28,7 +28,6 @@ from backend.stages.slopes import Slopes
 from backend.stages.surface import Surface
 from backend.storage.codec import decode
 from backend.storage.repositories import Repositories
-from backend.storage.rows import GivenRow, RunRow
 
 log = logging.getLogger(__name__)
 
@@ -138,15 +137,6 @@ def _last(
         return None
     found: T = decode(document_of(repositories, makers[-1].result), kind, context.store)
     return found
-
-
-def document_of(repositories: Repositories, result: RunRow | GivenRow) -> Mapping[str, Any]:
-    """Return a result's document, which plans come without."""
-    if isinstance(result, GivenRow):
-        return result.document
-    document = repositories.runs.get(result.id).document
-    assert document is not None, "a plan's present runs are finished"
-    return document
 
 
 def compare_with_truth(cloud: Cloud, truth: Truth) -> Scores | None:

@@ -16,7 +16,7 @@ from backend.domain.stage import Stage
 from backend.domain.states import JobStatus, StageStatus, Verdict
 from backend.jobs.calibrations import rig_identity
 from backend.jobs.edits import last_group
-from backend.jobs.loading import NO_RIG, LoadedScan, load_scan
+from backend.jobs.loading import NO_RIG, LoadedScan, document_of, load_scan
 from backend.jobs.plan import RIG, PlannedStage, gate_holds, run_level
 from backend.jobs.views import job_view
 from backend.services.context import Context
@@ -175,10 +175,7 @@ class Assembly:
         return self._context.shown.get(key, lambda: self._describe(planned.stage, result))
 
     def _describe(self, stage: Stage, result: GivenRow | RunRow) -> ShownResult:
-        document = result.document
-        if isinstance(result, RunRow):
-            document = self._repositories.runs.documents([result.id])[result.id]
-        return shown_result(stage, document or {}, self._context.store)
+        return shown_result(stage, document_of(self._repositories, result), self._context.store)
 
     # calibrations
 

@@ -7,10 +7,9 @@ from typing import Any, TypeVar
 from backend.contract.requests import EditSettings, StartRun
 from backend.domain.errors import StageUnavailableError, UnglareError
 from backend.domain.type_names import words
-from backend.jobs.loading import LoadedScan
+from backend.jobs.loading import LoadedScan, document_of
 from backend.services import editing, running
 from backend.services.context import Context
-from backend.services.reporting import document_of
 from backend.storage.codec import decode
 from backend.storage.repositories import Repositories
 

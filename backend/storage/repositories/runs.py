@@ -1,6 +1,6 @@
 """Runs of stages, and what operators decided about their results."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from datetime import datetime
 from typing import Any
@@ -102,12 +102,6 @@ class Runs:
         if not documents:
             query = query.options(defer(tables.Run.document, raiseload=True))
         return [_as_run(record, documents=documents) for record in self._session.scalars(query)]
-
-    def documents(self, runs: Iterable[str]) -> dict[str, dict[str, Any]]:
-        """Return the documents of finished runs by the runs' ids, in one query."""
-        query = select(tables.Run.id, tables.Run.document).where(tables.Run.id.in_(list(runs)))
-        found = self._session.execute(query)
-        return {run: document for run, document in found if document is not None}
 
     def finished(self, scan: str, key: str) -> RunRow | None:
         """Return the newest finished run with that key."""
