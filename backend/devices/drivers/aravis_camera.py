@@ -44,6 +44,7 @@ from backend.devices.protocols import (
     Range,
     TriggerSource,
 )
+from backend.devices.refusals import refuse_impossible, refuse_locked, refuse_trigger
 
 _BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 _SLICE_S = 0.1
@@ -314,11 +315,12 @@ class AravisCamera(Link):
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Check everything, then apply what changes, then read back."""
         self._need_link()
-        self._refuse_impossible(settings)
+        refuse_impossible(self.name, settings, self.capabilities)
         wanted = replace(
             settings, pixel_format=settings.pixel_format or self._settings.pixel_format
         )
-        self._refuse_while_armed(wanted)
+        if self._state is LinkState.ARMED:
+            refuse_locked(self.name, self._settings, wanted)
         try:
             self._apply(wanted)
             self._settings = self._read_settings()
@@ -326,43 +328,6 @@ class AravisCamera(Link):
             raise self._translated(error, "setting up") from error
         self._wanted = self._settings
         return self._settings
-
-    def _refuse_impossible(self, settings: CameraSettings) -> None:
-        can = self.capabilities
-        for feature, value, allowed in (
-            ("ExposureTime", settings.exposure_us, can.exposure_us),
-            ("Gain", settings.gain_db, can.gain_db),
-        ):
-            if value not in allowed:
-                raise FeatureError(
-                    self.name, f"{feature} {value:.10g} {allowed.unit} is not within {allowed}; choose another"
-                )  # fmt: skip
-        if settings.pixel_format not in (None, *can.pixel_formats):
-            raise FeatureError(
-                self.name,
-                f"PixelFormat {settings.pixel_format} is not one of {', '.join(can.pixel_formats)}; choose one of them",
-            )
-        if settings.trigger not in can.trigger_sources:
-            raise FeatureError(
-                self.name,
-                f"TriggerSource {settings.trigger} is not one of {', '.join(can.trigger_sources)}; choose one of them",
-            )
-        if settings.roi is not None:
-            raise UnsupportedFeature(
-                self.name, f"region {settings.roi} can't be set, the whole sensor is read; leave it out"
-            )  # fmt: skip
-
-    def _refuse_while_armed(self, wanted: CameraSettings) -> None:
-        if self._state is not LinkState.ARMED:
-            return
-        for feature, old, new in (
-            ("PixelFormat", self._settings.pixel_format, wanted.pixel_format),
-            ("TriggerSource", self._settings.trigger, wanted.trigger),
-        ):
-            if old != new:
-                raise FeatureError(
-                    self.name, f"{feature} {new} can't be set while armed; disarm first"
-                )
 
     def _apply(self, wanted: CameraSettings) -> None:
         now = self._settings
@@ -428,12 +393,7 @@ class AravisCamera(Link):
     def trigger(self) -> None:
         """Wait until the last exposure has ended, then start one."""
         self._need_link()
-        if self._state is not LinkState.ARMED:
-            raise FeatureError(self.name, "can't be triggered while not armed; arm it first")
-        if self._settings.trigger is not TriggerSource.SOFTWARE:
-            raise FeatureError(
-                self.name, f"TriggerSource is {self._settings.trigger}, not Software; set it before arming"
-            )  # fmt: skip
+        refuse_trigger(self.name, self._settings, armed=self._state is LinkState.ARMED)
         self._aborted.wait(max(0.0, self._free_at_s - time.monotonic()))
         try:
             self._call("arv_camera_execute_command", b"TriggerSoftware")

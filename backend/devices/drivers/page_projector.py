@@ -19,13 +19,13 @@ from backend.devices.errors import (
     DeviceError,
     DeviceNotFound,
     DeviceTimeout,
-    FeatureError,
     GeometryError,
 )
 from backend.devices.link import Link
 from backend.devices.options import DeviceOptions, DisplaySize, read_options
 from backend.devices.pages import Geometry, Page, PageDesk
 from backend.devices.protocols import DeviceInfo, LinkState, Presented, ProjectorCapabilities
+from backend.devices.refusals import refuse_level, refuse_other_sizes, refuse_unloaded
 
 _JOIN_S = 5.0
 _GEOMETRY_S = 2.0
@@ -116,31 +116,20 @@ class PageProjector(Link):
     def load(self, patterns: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
         """Send patterns to the page, so that showing them needs no network."""
         self._need_link()
-        width, height = self._options.size
-        for index, pattern in enumerate(patterns):
-            if pattern.shape != (height, width):
-                size = "x".join(map(str, pattern.shape[::-1]))
-                raise GeometryError(
-                    self.name,
-                    f"pattern {index} is {size}, the display {width}x{height}; render patterns in the display's size",
-                )
+        refuse_other_sizes(self.name, patterns, self._options.size)
         self._patterns = [np.ascontiguousarray(pattern).copy() for pattern in patterns]
         self._send_patterns()
 
     def show(self, index: int, timeout_s: float = 2.0) -> Presented:
         """Show a loaded pattern; returns after the page's acknowledgement and the settle time."""
         self._need_link()
-        if not 0 <= index < len(self._patterns):
-            raise FeatureError(
-                self.name, f"there is no pattern {index}, {len(self._patterns)} are loaded; load first"
-            )  # fmt: skip
+        refuse_unloaded(self.name, index, len(self._patterns))
         return self._asked({"t": "show", "slot": index}, index, timeout_s)
 
     def blank(self, level: int = 0) -> Presented:
         """Show the whole field at one code."""
         self._need_link()
-        if not 0 <= level <= 255:
-            raise FeatureError(self.name, f"level {level} is not within 0 to 255; choose another")
+        refuse_level(self.name, level)
         width, height = self._options.size
         return self._asked({"t": "blank", "level": level, "w": width, "h": height}, -1, 2.0)
 

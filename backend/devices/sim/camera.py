@@ -14,7 +14,6 @@ from backend.devices.errors import (
     DeviceTimeout,
     FeatureError,
     IncompleteFrame,
-    UnsupportedFeature,
 )
 from backend.devices.protocols import (
     CameraCapabilities,
@@ -25,6 +24,7 @@ from backend.devices.protocols import (
     Range,
     TriggerSource,
 )
+from backend.devices.refusals import refuse_impossible, refuse_locked, refuse_trigger
 from backend.devices.sim.clock import Clock
 from backend.devices.sim.link import SimulatedLink
 from backend.devices.sim.renderer import Shown
@@ -173,52 +173,19 @@ class SimulatedCamera(SimulatedLink):
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Check and apply settings."""
         self._need_link()
-        can = self.capabilities
         wanted = replace(
-            settings,
-            exposure_us=self._checked("ExposureTime", settings.exposure_us, can.exposure_us),
-            gain_db=self._checked("Gain", settings.gain_db, can.gain_db),
-            pixel_format=settings.pixel_format or self._settings.pixel_format,
+            settings, pixel_format=settings.pixel_format or self._settings.pixel_format
         )
-        if wanted.pixel_format not in _FORMATS:
-            raise FeatureError(
-                self.name,
-                f"PixelFormat {wanted.pixel_format} is not one of {', '.join(_FORMATS)}; choose one of them",
-            )
-        if wanted.trigger not in can.trigger_sources:
-            allowed = ", ".join(can.trigger_sources)
-            raise FeatureError(
-                self.name,
-                f"TriggerSource {wanted.trigger} is not one of {allowed}; choose one of them",
-            )
-        if wanted.roi is not None:
-            raise UnsupportedFeature(
-                self.name,
-                f"region {wanted.roi} can't be set, the whole sensor is read; leave it out",
-            )
-        self._refuse_while_armed(wanted)
-        self._settings = wanted
-        return wanted
-
-    def _checked(self, feature: str, value: float, allowed: Range) -> float:
-        if value not in allowed:
-            raise FeatureError(
-                self.name,
-                f"{feature} {value:.10g} {allowed.unit} is not within {allowed}; choose another",
-            )
-        return allowed.nearest(value)
-
-    def _refuse_while_armed(self, wanted: CameraSettings) -> None:
-        if self._state is not LinkState.ARMED:
-            return
-        for feature, old, new in (
-            ("PixelFormat", self._settings.pixel_format, wanted.pixel_format),
-            ("TriggerSource", self._settings.trigger, wanted.trigger),
-        ):
-            if old != new:
-                raise FeatureError(
-                    self.name, f"{feature} {new} can't be set while armed; disarm first"
-                )
+        can = self.capabilities
+        refuse_impossible(self.name, wanted, can)
+        if self._state is LinkState.ARMED:
+            refuse_locked(self.name, self._settings, wanted)
+        self._settings = replace(
+            wanted,
+            exposure_us=can.exposure_us.nearest(wanted.exposure_us),
+            gain_db=can.gain_db.nearest(wanted.gain_db),
+        )
+        return self._settings
 
     def arm(self, n_frames: int | None = None) -> None:
         """Start acquisition."""
@@ -250,12 +217,8 @@ class SimulatedCamera(SimulatedLink):
 
     def trigger(self) -> None:
         """Expose what the projector shows now."""
-        self._need_armed()
-        if self._settings.trigger is not TriggerSource.SOFTWARE:
-            raise FeatureError(
-                self.name,
-                f"TriggerSource is {self._settings.trigger}, not Software; set it before arming",
-            )
+        self._need_link()
+        refuse_trigger(self.name, self._settings, armed=self._state is LinkState.ARMED)
         self._clock.wait_until(self._busy_until_s, self._aborted)
         self._expose(self._look(), self._clock.now_s(), self._trigger_phase(self._next_id))
 
@@ -328,11 +291,6 @@ class SimulatedCamera(SimulatedLink):
                     f"no frame came within {timeout_s:g} s; trigger one, or check the line",
                 )
             return self._queue.popleft()
-
-    def _need_armed(self) -> None:
-        self._need_link()
-        if self._state is not LinkState.ARMED:
-            raise FeatureError(self.name, "can't be triggered while not armed; arm it first")
 
 
 class _Faults:

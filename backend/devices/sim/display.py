@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import UInt8
 
-from backend.devices.errors import FeatureError, GeometryError
 from backend.devices.protocols import DeviceInfo, Presented
+from backend.devices.refusals import refuse_level, refuse_other_sizes, refuse_unloaded
 from backend.devices.sim.link import SimulatedLink
 
 
@@ -22,33 +22,20 @@ class Display(SimulatedLink):
     def load(self, patterns: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
         """Take patterns; they are copied."""
         self._need_link()
-        width, height = self._size
-        for index, pattern in enumerate(patterns):
-            if pattern.shape != (height, width):
-                size = "x".join(map(str, pattern.shape[::-1]))
-                raise GeometryError(
-                    self.name,
-                    f"pattern {index} is {size}, the display {width}x{height};"
-                    " render patterns in the display's size",
-                )
+        refuse_other_sizes(self.name, patterns, self._size)
         self._patterns = [self._frozen(pattern) for pattern in patterns]
 
     def show(self, index: int, timeout_s: float = 2.0) -> Presented:
         """Show a loaded pattern; lit when this returns."""
         del timeout_s  # the display always follows
         self._need_link()
-        if not 0 <= index < len(self._patterns):
-            raise FeatureError(
-                self.name,
-                f"there is no pattern {index}, {len(self._patterns)} are loaded; load first",
-            )
+        refuse_unloaded(self.name, index, len(self._patterns))
         return self._present(self._patterns[index], index)
 
     def blank(self, level: int = 0) -> Presented:
         """Show the whole field at one code."""
         self._need_link()
-        if not 0 <= level <= 255:
-            raise FeatureError(self.name, f"level {level} is not within 0 to 255; choose another")
+        refuse_level(self.name, level)
         return self._present(self._uniform(level), -1)
 
     @abstractmethod
