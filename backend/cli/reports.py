@@ -19,7 +19,7 @@ from backend.cli.options import (
     Size,
     parse_rig_options,
 )
-from backend.cli.output import ProgressLines, answering, console, quiet_logging, table
+from backend.cli.output import Document, ProgressLines, answering, console, quiet_logging, table
 
 if TYPE_CHECKING:
     from backend.domain.shots import Progress
@@ -146,28 +146,30 @@ def edge_tolerance(
 
 def _report(make: Make, *, out: Path | None, data: Path | None, as_json: bool, quiet: bool) -> None:
     """Make a report, write it, show it."""
-    from backend.services.report_document import refuse_report_folder, write_report
+    from backend.services.report_document import refuse_report_folder
 
     quiet_logging()
-    found: Report | None = None
     with answering(as_json) as answer, ProgressLines(hidden=quiet) as progress:
         if out is not None:
             refuse_report_folder(out)
         with open_services(data) as services:
             found = make(services.context, lambda done, text="": progress.step(text, 0.0))
         progress.finish()
-        answer.update(found.document())
-        answer["files"] = []
-        if out is not None:
-            answer["files"] = [str(file) for file in write_report(out, found)]
-    if not as_json and found is not None:
-        show_report(found)
-        if out is not None:
-            console().print(f"page, tables and pictures are in {out}")
+        answer.update(written_report(found, out))
+    if not as_json:
+        show_report(found, out)
 
 
-def show_report(report: "Report") -> None:
-    """Print tables and sentences."""
+def written_report(report: "Report", folder: Path | None) -> Document:
+    """Write a report into its folder, if there is one, and return the command's answer."""
+    from backend.services.report_document import write_report
+
+    files = write_report(folder, report) if folder is not None else ()
+    return {**report.document(), "files": [str(file) for file in files]}
+
+
+def show_report(report: "Report", folder: Path | None) -> None:
+    """Print tables and sentences, and where the report was written."""
     out = console()
     out.print(report.title)
     for shown in report.tables:
@@ -182,3 +184,5 @@ def show_report(report: "Report") -> None:
         out.print(rows)
     for text in (*report.findings, *report.introduction):
         out.print(text)
+    if folder is not None:
+        out.print(f"page, tables and pictures are in {folder}")

@@ -1,17 +1,12 @@
 """`unglare validate`: whether a method reaches its figures, on simulated chains with independent seeds."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from backend.cli.options import AsJson, Quiet
-from backend.cli.output import ProgressLines, answering, console, quiet_logging
-from backend.cli.reports import show_report
-
-Out = Annotated[
-    Path | None, typer.Option(help="Folder for report.html, the tables as CSV and the pictures.")
-]
+from backend.cli.output import ProgressLines, answering, quiet_logging
+from backend.cli.reports import Out, show_report, written_report
 
 _validations = typer.Typer(
     name="validate",
@@ -45,7 +40,7 @@ def reflection(
     """Tell the phase error of every chain and representation, over all phases and at the paper's three lines."""
     quiet_logging()
     from backend.services.reflection_validation import known_letters, reflection_validation
-    from backend.services.report_document import refuse_report_folder, write_report
+    from backend.services.report_document import refuse_report_folder
 
     with answering(as_json) as answer, ProgressLines(hidden=quiet) as progress:
         letters = known_letters(chain)
@@ -58,9 +53,6 @@ def reflection(
             progress=lambda done, text="": progress.step(text, done),
         )
         progress.finish()
-        answer.update(report.document())
-        answer["files"] = [str(f) for f in write_report(out, report)] if out is not None else []
+        answer.update(written_report(report, out))
     if not as_json:
-        show_report(report)
-        if out is not None:
-            console().print(f"page, tables and pictures are in {out}")
+        show_report(report, out)

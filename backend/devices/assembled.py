@@ -1,9 +1,9 @@
 """A rig put together from single devices: any cameras, any projector."""
 
 from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 
+from backend.devices.opening import open_all
 from backend.devices.protocols import Camera, DeviceInfo, Projector
 from backend.domain.rig import CameraFacts, ProjectorFacts, RigCalibration, RigFacts
 
@@ -77,11 +77,7 @@ class AssembledRig:
 
     def open(self) -> None:
         """Open every device; when one refuses, the others are closed again."""
-        with ExitStack() as undo:
-            for device in (self._projector, *self._cameras.values()):
-                device.open()
-                undo.callback(device.close)
-            undo.pop_all()
+        open_all((self._projector, *self._cameras.values()))
 
     def close(self) -> None:
         """Close every device."""

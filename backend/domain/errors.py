@@ -18,6 +18,18 @@ class UnglareError(Exception):
         self.details = dict(details or {})
 
 
+def sentence_of(error: Exception) -> str:
+    """Make a sentence of the text of an error that isn't one yet: capital letter and full stop.
+
+    Examples
+    --------
+    >>> sentence_of(ValueError("the ramp isn't monotone: measure it again"))
+    "The ramp isn't monotone: measure it again."
+    """
+    text = str(error)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 class NotFoundError(UnglareError):
     """A scan, stage, artifact, method, rig or file that isn't there. Check the name."""
 

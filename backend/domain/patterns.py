@@ -43,6 +43,16 @@ class Gray(_Pattern):
     inverse: bool = False
 
 
+def gray_code(axis: Axis, codes: int) -> tuple[Gray, ...]:
+    """List the Gray code of so many codes, coarsest bit first, each bit beside its inverse."""
+    bits = max(1, (codes - 1).bit_length())
+    return tuple(
+        Gray(axis=axis, bit=bit, bits=bits, codes=codes, inverse=inverse)
+        for bit in reversed(range(bits))
+        for inverse in (False, True)
+    )
+
+
 class Stripe(_Pattern):
     """Black and white stripes: white where frac(periods x - shift) < 1/2, `inverse` swaps."""
 

@@ -17,7 +17,6 @@ from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.shots import Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Level, Review
-from backend.numerics.camera_model import compose, inverse
 from backend.numerics.epipolar_bands import Bands, EpipolarLines, bands_around, epipolar_lines
 from backend.stages.base_exposure import BaseExposure
 from backend.stages.cloud import Cloud
@@ -25,12 +24,7 @@ from backend.stages.exposures import Exposures
 from backend.stages.fringe_phase import AbsolutePhase
 from backend.stages.pixel_response import PixelResponse
 from backend.stages.pre_exposure import ExposureGrid
-from backend.stages.rig_geometry import (
-    from_reference,
-    pinhole,
-    projector_from_reference,
-    require_camera,
-)
+from backend.stages.rig_geometry import pair_geometry
 
 _NO_EXPOSURE = 255
 _SAMPLE = 2000
@@ -152,15 +146,12 @@ def doubtful_pixels(phase: AbsolutePhase, cloud: Cloud) -> Bool[np.ndarray, "h w
 
 def lines(calibration: RigCalibration, camera: str) -> EpipolarLines:
     """Return the epipolar lines of a camera and the projector, or say what isn't calibrated."""
-    projector_from_rig = projector_from_reference(calibration)
-    if calibration.projector is None or projector_from_rig is None:
+    pair = pair_geometry(calibration, camera)
+    if pair is None:
         raise StageFailedError(
             "The projector isn't calibrated: bands follow its epipolar lines; calibrate it or go on without bands."
         )
-    model = require_camera(calibration, camera)
-    camera_from_rig = from_reference(calibration, calibration.camera_from_world[camera])
-    pose = compose(projector_from_rig, inverse(camera_from_rig))
-    return epipolar_lines(model, pinhole(calibration.projector), pose)
+    return epipolar_lines(*pair)
 
 
 @dataclass(frozen=True)

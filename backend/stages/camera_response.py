@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from backend.domain.checks import Check, at_most
-from backend.domain.errors import StageFailedError
+from backend.domain.errors import StageFailedError, sentence_of
 from backend.domain.hints import Curve, Value
 from backend.domain.params import Params, setting
 from backend.domain.stage import stage
@@ -138,8 +138,7 @@ def _problem(
             highest_gray=highest_gray,
         )
     except NumericsError as error:
-        text = str(error)
-        raise StageFailedError(f"{text[:1].upper()}{text[1:]}.") from error
+        raise StageFailedError(sentence_of(error)) from error
 
 
 def _opencv(stack: Stack, levels: int) -> Float[np.ndarray, "level"]:

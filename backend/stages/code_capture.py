@@ -6,7 +6,7 @@ from backend.domain.checks import Check
 from backend.domain.errors import StageFailedError
 from backend.domain.frames import InMemory
 from backend.domain.params import Params, setting
-from backend.domain.patterns import Axis, Gray, Pattern, Stripe
+from backend.domain.patterns import Axis, Gray, Pattern, Stripe, gray_code
 from backend.domain.rig import ProjectorFacts, RigFacts
 from backend.domain.shots import Plan, Shoot, Shot
 from backend.domain.stage import stage
@@ -109,13 +109,7 @@ def code_patterns(projector: ProjectorFacts, params: CodeCaptureParams) -> tuple
 
 def gray_patterns(axis: Axis, size_px: int, finest_px: int = 1) -> tuple[Gray, ...]:
     """List a Gray code down to stripes of a width, coarsest first, each bit beside its inverse."""
-    codes = -(-size_px // finest_px)
-    bits = max(1, (codes - 1).bit_length())
-    return tuple(
-        Gray(axis=axis, bit=bit, bits=bits, codes=codes, inverse=inverse)
-        for bit in reversed(range(bits))
-        for inverse in (False, True)
-    )
+    return gray_code(axis, -(-size_px // finest_px))
 
 
 def stripe_patterns(axis: Axis, size_px: int, period_px: int, step_px: int) -> tuple[Stripe, ...]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32
 
 from backend.domain.errors import StageFailedError
 from backend.domain.frames import Frame, Pixels
-from backend.domain.patterns import Axis, Gray
+from backend.domain.patterns import Axis, Gray, gray_code
 from backend.domain.rig import CameraFacts, ProjectorFacts, RigFacts
 from backend.domain.shots import Plan, Shot
 from backend.numerics.code_certainty import (
@@ -61,19 +61,9 @@ class CodeShots:
     """Camera against projector, where it is known: light that came by a second reflection is told by it."""
 
 
-def code_bits(size_px: int) -> int:
-    """Return the bits that a code with one stripe per projector pixel needs."""
-    return max(1, int(np.ceil(np.log2(size_px))))
-
-
 def code_patterns(projector: ProjectorFacts) -> tuple[Gray, ...]:
-    """List the Gray code of columns, then of rows, coarsest bit first, each pattern before its inverse."""
-    return tuple(
-        Gray(axis=axis, bit=bit, bits=code_bits(size), codes=size, inverse=inverse)
-        for axis, size in _sizes(projector).items()
-        for bit in reversed(range(code_bits(size)))
-        for inverse in (False, True)
-    )
+    """List the Gray code of columns, then of rows, with one stripe per projector pixel."""
+    return tuple(p for axis, size in _sizes(projector).items() for p in gray_code(axis, size))
 
 
 def code_map_plan(facts: RigFacts, how: CodeShots) -> Plan[Mapping[str, CodeMap]]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from backend.domain.rig import RigCalibration
 from backend.numerics import filters
-from backend.numerics.camera_model import Pinhole, RigidTransform, compose, inverse
+from backend.numerics.camera_model import Pinhole, RigidTransform, inverse
 from backend.numerics.filters import Kept
 from backend.numerics.gathering import gather
 from backend.numerics.normals import normal_limit, normals
@@ -18,7 +18,7 @@ from backend.numerics.triangulation import Cloud as OrganisedCloud
 from backend.numerics.triangulation import projector_consistency, triangulate_projector
 from backend.stages.cloud import Cloud, FilterRow, colour_of
 from backend.stages.edges import Codes
-from backend.stages.rig_geometry import from_reference, pinhole, require_camera
+from backend.stages.rig_geometry import from_reference, pair_geometry
 
 _EXPOSURE_UNKNOWN = 255
 _SPREADS = 2.7
@@ -107,20 +107,13 @@ def dense_cloud(
 
 
 def _view(codes: Codes, calibration: RigCalibration, name: str, params: DenseParams) -> _View:
-    assert calibration.projector is not None, "the stage refuses a projector without calibration"
-    assert calibration.projector_from_world is not None, "the stage refuses one without pose"
-    camera, projector = require_camera(calibration, name), pinhole(calibration.projector)
-    reference = from_reference(calibration, calibration.camera_from_world[name])
-    pose = compose(
-        from_reference(calibration, calibration.projector_from_world), inverse(reference)
-    )
+    pair = pair_geometry(calibration, name)
+    assert pair is not None, "the stage refuses a projector without calibration or pose"
     column_px, sigma_px = codes.projector_px[name], codes.sigma_px[name]
-    points = triangulate_projector(column_px, camera, projector, pose, sigma_projector_px=sigma_px)
+    points = triangulate_projector(column_px, *pair, sigma_projector_px=sigma_px)
     reasons = codes.reasons[name].copy()
     reasons[(reasons == 0) & ~np.isfinite(points.depth_mm)] |= np.uint16(Reason.NO_MATCH)
-    view = _View(
-        name, camera, projector, pose, column_px, sigma_px, points, reasons, [], float("nan")
-    )
+    view = _View(name, *pair, column_px, sigma_px, points, reasons, [], float("nan"))
     depth_mm = points.depth_mm
     far_mm = np.inf if params.far_mm is None else params.far_mm
     view.reject(

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from backend.domain.patterns import Axis, Gray, Pattern, Sine
+from backend.domain.patterns import Axis, Pattern, Sine, gray_code
 from backend.domain.rig import ProjectorFacts
 
 Aid = Literal["none", "gray", "complementary_gray"]
@@ -60,9 +60,4 @@ class FringeDesign:
         if self.aid == "none":
             return []
         codes = int(np.ceil(max(self.periods))) * (2 if self.aid == "complementary_gray" else 1)
-        bits = max(1, int(np.ceil(np.log2(codes))))
-        return [
-            Gray(axis=axis, bit=bit, bits=bits, codes=codes, inverse=inverse)
-            for bit in reversed(range(bits))
-            for inverse in (False, True)
-        ]
+        return list(gray_code(axis, codes))

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from backend.domain.checks import Check, at_least
-from backend.domain.errors import StageFailedError
+from backend.domain.errors import StageFailedError, sentence_of
 from backend.domain.hints import Picture, Value
 from backend.domain.params import Params, setting
 from backend.domain.rig import RigFacts
@@ -92,8 +92,7 @@ def interval(
             return _without_stack(curve, levels, params)
         return _searched(curve, response, levels, params)
     except NumericsError as error:
-        text = str(error)
-        raise StageFailedError(f"{text[:1].upper()}{text[1:]}.") from error
+        raise StageFailedError(sentence_of(error)) from error
 
 
 def _check_belongs(ramp: Ramp, response: Response | None, facts: RigFacts | None) -> None:

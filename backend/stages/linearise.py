@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from backend.domain.checks import Check, at_most
-from backend.domain.errors import StageFailedError
+from backend.domain.errors import StageFailedError, sentence_of
 from backend.domain.hints import Curve, Table, Value
 from backend.domain.params import Params, setting
 from backend.domain.rig import RigFacts
@@ -157,8 +157,7 @@ def linearise(
             for name, shown in candidates.items()
         }
     except NumericsError as error:
-        text = str(error)
-        raise StageFailedError(f"{text[:1].upper()}{text[1:]}.") from error
+        raise StageFailedError(sentence_of(error)) from error
     at_steps = {name: by_steps[params.steps].all_rad for name, by_steps in errors.items()}
     chosen = params.representation or choose(at_steps)
     if chosen not in candidates:

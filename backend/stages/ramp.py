@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from backend.domain.checks import Check, at_least
-from backend.domain.errors import StageFailedError
+from backend.domain.errors import StageFailedError, sentence_of
 from backend.domain.frames import Frame
 from backend.domain.hints import Curve, Mask, Value
 from backend.domain.params import Params, setting
@@ -74,8 +74,7 @@ def monotone(ramp: Ramp) -> MonotoneRamp:
     try:
         return monotone_ramp(ramp.control, ramp.gray, full_scale_gray=ramp.full_scale_gray)
     except NumericsError as error:
-        text = str(error)
-        raise StageFailedError(f"{text[:1].upper()}{text[1:]}.") from error
+        raise StageFailedError(sentence_of(error)) from error
 
 
 def ramp_from_table(

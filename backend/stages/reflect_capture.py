@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from backend.domain.checks import Check
-from backend.domain.errors import InvalidSettingError, StageFailedError
+from backend.domain.errors import InvalidSettingError, StageFailedError, sentence_of
 from backend.domain.frames import Frame
 from backend.domain.hints import Frames, Value
 from backend.domain.params import Params, setting
@@ -79,7 +79,7 @@ def reflect_capture(
         try:
             check_periods(sorted(periods))
         except FrequencyError as error:
-            raise InvalidSettingError(f"{str(error)[0].upper()}{str(error)[1:]}.") from error
+            raise InvalidSettingError(sentence_of(error)) from error
     return shoot(capture_plan(reflect_patterns(params, linear), exposure_ms, params))
 
 

@@ -26,20 +26,25 @@ def projector_from_reference(calibration: RigCalibration) -> RigidTransform | No
     return from_reference(calibration, calibration.projector_from_world)
 
 
+def pair_geometry(calibration: RigCalibration, camera: str) -> PairGeometry | None:
+    """Return a camera against the projector; None if the projector isn't calibrated."""
+    projector_from_rig = projector_from_reference(calibration)
+    if calibration.projector is None or projector_from_rig is None:
+        return None
+    model = require_camera(calibration, camera)
+    camera_from_rig = from_reference(calibration, calibration.camera_from_world[camera])
+    pose = compose(projector_from_rig, inverse(camera_from_rig))
+    return PairGeometry(model, pinhole(calibration.projector), pose)
+
+
 def camera_geometry(
     calibration: RigCalibration | None, cameras: Sequence[str]
 ) -> Mapping[str, PairGeometry]:
     """Return each camera against the projector; empty where the rig or its projector isn't calibrated."""
-    projector_from_rig = None if calibration is None else projector_from_reference(calibration)
-    if calibration is None or calibration.projector is None or projector_from_rig is None:
+    if calibration is None:
         return {}
-    found = {}
-    for name in cameras:
-        camera = require_camera(calibration, name)
-        camera_from_rig = from_reference(calibration, calibration.camera_from_world[name])
-        pose = compose(projector_from_rig, inverse(camera_from_rig))
-        found[name] = PairGeometry(camera, pinhole(calibration.projector), pose)
-    return found
+    pairs = {name: pair_geometry(calibration, name) for name in cameras}
+    return {name: pair for name, pair in pairs.items() if pair is not None}
 
 
 def require_camera(calibration: RigCalibration, name: str) -> Pinhole:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, UInt16
 
 from backend.domain.arrays import ArrayHash, LoadArray
 from backend.domain.checks import Check, at_least
-from backend.domain.errors import InvalidSettingError, StageFailedError
+from backend.domain.errors import InvalidSettingError, StageFailedError, sentence_of
 from backend.domain.hints import Curve, Mask, Picture, Table, Value
 from backend.domain.params import Params, setting
 from backend.domain.rig import RigFacts
@@ -240,7 +240,7 @@ def screen_phase(
         try:
             decoded.append(_decode(camera, of_camera, frames, linear, ramp, facts, params, load))
         except NumericsError as error:
-            raise StageFailedError(f"{str(error)[0].upper()}{str(error)[1:]}.") from error
+            raise StageFailedError(sentence_of(error)) from error
     return _summarise(decoded)
 
 

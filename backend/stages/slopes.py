@@ -9,7 +9,12 @@ from jaxtyping import Bool, Float, Float32, Float64
 
 from backend.domain.arrays import ArrayHash, LoadArray
 from backend.domain.checks import Check, at_least
-from backend.domain.errors import InvalidCalibrationError, InvalidSettingError, StageFailedError
+from backend.domain.errors import (
+    InvalidCalibrationError,
+    InvalidSettingError,
+    StageFailedError,
+    sentence_of,
+)
 from backend.domain.hints import Picture, Value
 from backend.domain.params import Params, setting
 from backend.domain.rig import Pose, RigCalibration
@@ -188,9 +193,9 @@ def slopes(
         progress(0.8, "errors and curvature")
         design = _design(params, found, load)
     except ScreenError as error:
-        raise InvalidCalibrationError(f"{str(error)[0].upper()}{str(error)[1:]}.") from error
+        raise InvalidCalibrationError(sentence_of(error)) from error
     except NumericsError as error:
-        raise StageFailedError(f"{str(error)[0].upper()}{str(error)[1:]}.") from error
+        raise StageFailedError(sentence_of(error)) from error
     return _describe(scene, found, design, pose_from, aligned, params)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Int64, Integer
 
 from backend.domain.checks import Check, at_least
-from backend.domain.errors import InvalidCaptureError, StageFailedError
+from backend.domain.errors import InvalidCaptureError, StageFailedError, sentence_of
 from backend.domain.frames import Frame
 from backend.domain.hints import Frames, Mask, Table, Value
 from backend.domain.params import Params, setting
@@ -256,7 +256,7 @@ def make_stack(
             pictures, full_scale_gray=full_scale, count=points, region=inside
         )
     except NumericsError as error:
-        raise StageFailedError(_sentence(error)) from error
+        raise StageFailedError(sentence_of(error)) from error
     return Stack(
         frames=ordered,
         exposures_ms=exposures_ms,
@@ -268,11 +268,6 @@ def make_stack(
         full_scale_gray=float(full_scale),
         screen_px=screen_px,
     )
-
-
-def _sentence(error: NumericsError) -> str:
-    text = str(error)
-    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _row(frame: Frame, region: Bool[np.ndarray, "h w"]) -> StackRow:

@@ -76,10 +76,15 @@ def _view(
     return View(model, looking_at(np.array(position_mm), target))
 
 
-def looking_at(position_mm: Float[np.ndarray, "3"], target_mm: Float[np.ndarray, "3"]) -> Pose:
+def looking_at(
+    position_mm: Float[np.ndarray, "3"],
+    target_mm: Float[np.ndarray, "3"],
+    *,
+    down: tuple[float, float, float] = (0.0, 1.0, 0.0),
+) -> Pose:
     """Return the pose of a device that looks at a target with its x axis level."""
     z = (target_mm - position_mm) / np.linalg.norm(target_mm - position_mm)
-    x = np.cross([0.0, 1.0, 0.0], z)
+    x = np.cross(down, z)
     x /= np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z])
     return Pose(R, -R @ position_mm)

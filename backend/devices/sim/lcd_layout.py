@@ -5,12 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
+from backend.devices.sim.layout import looking_at
 from backend.devices.sim.lcd_config import SimulatedLcdConfig
 from backend.domain.rig import PinholeModel, Pose, ScreenModel
 
 _DECENTRE = (0.003, -0.002)
 """Real lenses aren't centred on their sensors: as shares of the width."""
 _BENT_COLUMNS = 129
+_DOWN_IN_MIRROR = (0.0, -1.0, 0.0)
+"""The mirror's +Y is up."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ def lcd_layout(config: SimulatedLcdConfig) -> LcdLayout:
     """Place camera below and screen above the mirror's normal, both facing the mirror."""
     up = np.deg2rad(config.angle_deg)
     camera_mm = config.camera_distance_mm * np.array([0.0, -np.sin(up), np.cos(up)])
-    camera = _facing(camera_mm, towards=np.array([*config.aim_mm, 0.0]) - camera_mm)
+    camera = looking_at(camera_mm, np.array([*config.aim_mm, 0.0]), down=_DOWN_IN_MIRROR)
     screen = _screen(config, up)
     mirror_from_camera = _inverse(camera)
     return LcdLayout(
@@ -69,15 +72,6 @@ def _turned(about_x: float, about_y: float) -> Float64[np.ndarray, "3 3"]:
     first = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
     second = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
     return np.asarray(second @ first)
-
-
-def _facing(position: Float[np.ndarray, "3"], towards: Float[np.ndarray, "3"]) -> Pose:
-    """Return the pose of a camera whose x axis is level in the mirror's frame, whose +Y is up."""
-    z = towards / np.linalg.norm(towards)
-    x = np.cross(z, [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    return Pose(R, -R @ position)
 
 
 def _inverse(pose: Pose) -> Pose:

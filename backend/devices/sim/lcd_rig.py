@@ -1,8 +1,6 @@
 """The simulated rig for mirrors: one camera that sees a screen in the part, all in physical units."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from threading import Lock
 
@@ -10,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
 from backend.devices.errors import RigConfigError
+from backend.devices.opening import open_all
 from backend.devices.options import read_options
 from backend.devices.protocols import Camera, DeviceInfo
 from backend.devices.sim import kernels, lcd_kernels
@@ -30,6 +29,7 @@ from backend.devices.sim.lcd_layout import screen_model
 from backend.devices.sim.lcd_light import Panel, light
 from backend.devices.sim.lcd_world import LcdWorld, lcd_world
 from backend.devices.sim.mirrors import check_mirror
+from backend.devices.sim.rig_info import rig_info
 from backend.devices.sim.screen import Lit, SimulatedScreen, share_of_before
 from backend.domain.rig import CameraFacts, Pose, ProjectorFacts, RigCalibration, RigFacts
 from backend.numerics.mirror_scoring import MirrorTruth
@@ -86,12 +86,9 @@ class SimulatedLcdRig:
     @property
     def info(self) -> DeviceInfo:
         """Who built the rig: we did."""
-        try:
-            release = version("unglare")
-        except PackageNotFoundError:  # run from a source tree
-            release = ""
-        model = f"simulated screen and mirror, {self.config.scene}, chain {self.config.chain}"
-        return DeviceInfo("unglare", model, driver=release, simulated=True)
+        return rig_info(
+            f"simulated screen and mirror, {self.config.scene}, chain {self.config.chain}"
+        )
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -106,11 +103,7 @@ class SimulatedLcdRig:
     def open(self) -> None:
         """Follow the rays and open the devices."""
         self._load()
-        with ExitStack() as undo:
-            for device in (self._screen, self._camera):
-                device.open()
-                undo.callback(device.close)
-            undo.pop_all()
+        open_all((self._screen, self._camera))
 
     def close(self) -> None:
         """Close the devices; what the rays met is kept for the next rig like this one."""

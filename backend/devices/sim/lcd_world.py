@@ -1,13 +1,11 @@
 """A mirror before the rig, its rays followed once and kept: opening the same rig again costs nothing."""
 
-import threading
-from collections import OrderedDict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from backend.devices.sim.kept import Kept
 from backend.devices.sim.lcd_config import SimulatedLcdConfig
 from backend.devices.sim.lcd_layout import LcdLayout, lcd_layout
 from backend.devices.sim.lcd_light import Footprints, footprints
@@ -25,7 +23,6 @@ _GEOMETRY = (
     *("viewing_loss", "surround_share"),
 )
 """Settings that the rays and their weights depend on."""
-_KEPT = 3
 
 
 class LcdWorld:
@@ -74,8 +71,7 @@ class LcdWorld:
         )
 
 
-_worlds: OrderedDict[tuple[Any, ...], LcdWorld] = OrderedDict()
-_lock = threading.Lock()
+_worlds = Kept[LcdWorld](most=3)
 
 
 def lcd_world(config: SimulatedLcdConfig) -> LcdWorld:
@@ -89,10 +85,4 @@ def lcd_world(config: SimulatedLcdConfig) -> LcdWorld:
     file = Path(config.scene.partition(":")[2] or ".")
     stamp = file.stat().st_mtime_ns if file.is_file() else 0  # an edited file is read again
     key = (*(getattr(config, name) for name in _GEOMETRY), stamp)
-    with _lock:
-        if key not in _worlds:
-            _worlds[key] = LcdWorld(config)
-            while len(_worlds) > _KEPT:
-                _worlds.popitem(last=False)
-        _worlds.move_to_end(key)
-        return _worlds[key]
+    return _worlds.get(key, lambda: LcdWorld(config))

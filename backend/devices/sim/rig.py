@@ -1,14 +1,13 @@
 """The simulated rig: two cameras (or one) and a projector before a scene, all in physical units."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from threading import Lock
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
+from backend.devices.opening import open_all
 from backend.devices.options import read_options
 from backend.devices.protocols import Camera, DeviceInfo
 from backend.devices.sim.camera import Exposure, SimulatedCamera
@@ -18,6 +17,7 @@ from backend.devices.sim.layout import layout, relative
 from backend.devices.sim.optics import veil
 from backend.devices.sim.projector import SimulatedProjector
 from backend.devices.sim.renderer import Beam, LightPaths, light_paths
+from backend.devices.sim.rig_info import rig_info
 from backend.devices.sim.scenes import check_name
 from backend.devices.sim.sensor import Sensor
 from backend.devices.sim.world import World, world
@@ -82,13 +82,7 @@ class SimulatedRig:
     @property
     def info(self) -> DeviceInfo:
         """Who built the rig: we did."""
-        try:
-            release = version("unglare")
-        except PackageNotFoundError:  # run from a source tree
-            release = ""
-        return DeviceInfo(
-            "unglare", f"simulated rig, scene {self.config.scene}", driver=release, simulated=True
-        )
+        return rig_info(f"simulated rig, scene {self.config.scene}")
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -103,11 +97,7 @@ class SimulatedRig:
     def open(self) -> None:
         """Cast the scene and open the devices."""
         self._load()
-        with ExitStack() as undo:
-            for device in (self._projector, *self._cameras.values()):
-                device.open()
-                undo.callback(device.close)
-            undo.pop_all()
+        open_all((self._projector, *self._cameras.values()))
 
     def close(self) -> None:
         """Close the devices; the cast scene is kept for the next rig like this one."""

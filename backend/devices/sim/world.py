@@ -1,15 +1,14 @@
 """A scene before a rig's lenses, ray-cast once and kept: opening the same rig again costs nothing."""
 
 import threading
-from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
 
 from backend.devices.sim.config import SimulatedRigConfig
+from backend.devices.sim.kept import Kept
 from backend.devices.sim.layout import Layout, View, layout
 from backend.devices.sim.rays import pixel_rays, project
 from backend.devices.sim.scenes import scene
@@ -24,7 +23,6 @@ _GEOMETRY = (
     *("camera_distortion", "projector_distortion"),
 )
 """Settings that a cast depends on."""
-_KEPT = 3
 
 
 class World:
@@ -84,8 +82,7 @@ class World:
         return seen
 
 
-_worlds: OrderedDict[tuple[Any, ...], World] = OrderedDict()
-_lock = threading.Lock()
+_worlds = Kept[World](most=3)
 
 
 def world(config: SimulatedRigConfig) -> World:
@@ -97,13 +94,7 @@ def world(config: SimulatedRigConfig) -> World:
         If the scene's mesh or material table can't be read.
     """
     key = (*(getattr(config, name) for name in _GEOMETRY), _stamps(config.scene))
-    with _lock:
-        if key not in _worlds:
-            _worlds[key] = World(config)
-            while len(_worlds) > _KEPT:
-                _worlds.popitem(last=False)
-        _worlds.move_to_end(key)
-        return _worlds[key]
+    return _worlds.get(key, lambda: World(config))
 
 
 def _stamps(scene_name: str) -> tuple[int, ...]:
