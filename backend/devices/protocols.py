@@ -148,6 +148,9 @@ class ProjectorCapabilities:
     pixel_layout: str = "square"
     """`square`, or `diamond` for DLP chips with rotated mirrors."""
     trigger_out: bool = False
+    certain: bool = False
+    """Whether a pattern is lit by construction when `show` returns. False: electronics that nobody has looked into
+    stand between, and every scan verifies by its frames that the light followed."""
 
 
 @dataclass(frozen=True)
@@ -365,6 +368,16 @@ class Rig(Protocol):
 
     def __exit__(self, *exc: object) -> None:
         """Close."""
+        ...
+
+
+@runtime_checkable
+class Wired(Protocol):
+    """A rig whose projector's trigger output is wired to cameras: bursts can be timed by hardware."""
+
+    @property
+    def trigger_lines(self) -> Mapping[str, TriggerSource]:
+        """The line of each wired camera that the projector's trigger output drives; the others are left out."""
         ...
 
 

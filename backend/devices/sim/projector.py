@@ -50,6 +50,7 @@ class SimulatedProjector(Display):
             max_sequence=_MAX_SEQUENCE,
             linear=self._config.gamma == 1.0,
             trigger_out=True,
+            certain=True,
         )
 
     def arm_sequence(self, indices: Sequence[int], exposure_us: float, period_us: float) -> None:

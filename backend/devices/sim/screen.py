@@ -69,7 +69,7 @@ class SimulatedScreen(Display):
     @property
     def capabilities(self) -> ProjectorCapabilities:
         """What it can do."""
-        return ProjectorCapabilities(size=self._size, refresh_hz=1.0 / self._period_s)
+        return ProjectorCapabilities(size=self._size, refresh_hz=1.0 / self._period_s, certain=True)
 
     def _present(self, pattern: UInt8[np.ndarray, "h w"], index: int) -> Presented:
         if self._fail_after is not None and self._shows >= self._fail_after:
