@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from backend.cli.checking import check_rig
+from backend.cli.discovering import discover
 from backend.cli.options import AsJson, DataFolder
 from backend.cli.output import answering, console, quiet_logging, table
 
@@ -31,6 +32,7 @@ def register(application: typer.Typer) -> None:
     group.command("remove")(remove)
     group.command("check")(check_rig)
     group.command("latency")(latency)
+    group.command("discover")(discover)
     application.add_typer(group)
 
 

@@ -55,20 +55,18 @@ def available_drivers(group: str) -> tuple[str, ...]:
     return (*_BUILT_IN[group], *sorted(_entries(group).keys() - _BUILT_IN[group].keys()))
 
 
-def _made(group: str, name: str, driver: str, options: Mapping[str, Any], **more: object) -> Any:
-    factory = _factory(group, name, driver)
-    try:
-        return factory(name, dict(options), **more)
-    except UnglareError:
-        raise
-    except Exception as error:
-        # A third party's factory may raise anything; the cause keeps its traceback.
-        raise RigConfigError(
-            f"{name}: driver {driver} failed with {type(error).__name__}: {error}; check its options"
-        ) from error
+def load_factory(group: str, name: str, driver: str) -> Callable[..., Any]:
+    """Import a driver and return its factory; `name` is what sentences call the device.
 
+    A factory may have attributes: `options_model`, the pydantic model of the options that it takes, and of a
+    camera's `search`, a function that returns a `FoundCamera` for each camera it can see. Searching may
+    broadcast: it is only called when an operator asks for it.
 
-def _factory(group: str, name: str, driver: str) -> Callable[..., Any]:
+    Raises
+    ------
+    RigConfigError
+        If there is no such driver or it can't be loaded.
+    """
     entry = _entries(group).get(driver)
     place = _BUILT_IN[group].get(driver)
     try:
@@ -85,6 +83,19 @@ def _factory(group: str, name: str, driver: str) -> Callable[..., Any]:
         ) from error
     known = ", ".join(available_drivers(group))
     raise RigConfigError(f"{name}: there is no driver {driver!r}; choose {known}")
+
+
+def _made(group: str, name: str, driver: str, options: Mapping[str, Any], **more: object) -> Any:
+    factory = load_factory(group, name, driver)
+    try:
+        return factory(name, dict(options), **more)
+    except UnglareError:
+        raise
+    except Exception as error:
+        # A third party's factory may raise anything; the cause keeps its traceback.
+        raise RigConfigError(
+            f"{name}: driver {driver} failed with {type(error).__name__}: {error}; check its options"
+        ) from error
 
 
 def _entries(group: str) -> dict[str, EntryPoint]:

@@ -291,7 +291,12 @@ class GigECamera:
 
     def _release(self) -> None:
         self._client = None
-        self._registers.number(Bootstrap.CONTROL, 0)
+        for register in (
+            Bootstrap.CONTROL,
+            Bootstrap.CONTROLLER_PORT,
+            Bootstrap.CONTROLLER_ADDRESS,
+        ):
+            self._registers.number(register, 0)
         self._stop_acquisition()
 
     def _carry_out(self, asked: Request, client: tuple[str, int]) -> bytes:
@@ -335,7 +340,12 @@ class GigECamera:
             self._release()
             return
         self._client, self._heard_s = client, time.monotonic()
+        address, port = client
         self._registers.number(Bootstrap.CONTROL, privilege)
+        self._registers.number(Bootstrap.CONTROLLER_PORT, port)
+        self._registers.number(
+            Bootstrap.CONTROLLER_ADDRESS, int.from_bytes(socket.inet_aton(address))
+        )
 
     # ------------------------------------------------------------ acquisition
 

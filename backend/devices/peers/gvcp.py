@@ -5,6 +5,7 @@ Source: GigE Vision's public facts as every open driver uses them: big endian, U
 
 import socket
 import struct
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -73,6 +74,8 @@ class Bootstrap(IntEnum):
     TICK_FREQUENCY_HIGH = 0x093C
     TICK_FREQUENCY_LOW = 0x0940
     CONTROL = 0x0A00
+    CONTROLLER_PORT = 0x0A04
+    CONTROLLER_ADDRESS = 0x0A14
     STREAM_PORT = 0x0D00
     PACKET_SIZE = 0x0D04
     PACKET_DELAY = 0x0D08
@@ -130,23 +133,63 @@ def ask(addresses: Sequence[str], *, timeout_s: float = 0.3) -> tuple[Found, ...
     Parameters
     ----------
     addresses
-        IPv4 addresses; each gets one datagram. Nothing is broadcast.
+        IPv4 addresses; each gets one datagram. Nothing is broadcast: the system refuses such an address
+        to a socket like this one.
     timeout_s
         How long to wait for the slowest, in [s].
     """
     found: dict[str, Found] = {}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        asking.settimeout(timeout_s)
-        for address in addresses:
-            asking.sendto(request(Command.DISCOVERY), (address, PORT))
+        waiting_for = {a for a in addresses if _sent(asking, request(Command.DISCOVERY), a)}
+        deadline_s = time.monotonic() + timeout_s
+        while waiting_for and (came := _received(asking, deadline_s)):
+            data, address = came
+            device = _found(address, data)
+            if device and address in waiting_for:
+                found[address] = device
+                waiting_for.discard(address)
+    return tuple(found[a] for a in dict.fromkeys(addresses) if a in found)
+
+
+def read_register(address: str, register: int, *, timeout_s: float = 0.3) -> int | Status | None:
+    """Ask one device for one of its registers: the value, why it refuses, or None if it doesn't answer.
+
+    Reading needs no control, so a camera that somebody uses isn't disturbed.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        question = request(Command.READ_REGISTER, register.to_bytes(4))
+        came = _sent(asking, question, address) and _received(asking, time.monotonic() + timeout_s)
+        if not came:
+            return None
+        data, _ = came
+    status, command, _length, _id = _ANSWER.unpack_from(data.ljust(_ANSWER.size, b"\0"))
+    if command != Command.READ_REGISTER + 1:
+        return None
+    if status == Status.SUCCESS and len(data) >= _ANSWER.size + 4:
+        return int.from_bytes(data[_ANSWER.size : _ANSWER.size + 4])
+    return Status(status) if status in set(Status) else Status.ERROR
+
+
+def _sent(asking: socket.socket, packet: bytes, address: str) -> bool:
+    try:
+        asking.sendto(packet, (address, PORT))
+    except OSError:  # no way leads there
+        return False
+    return True
+
+
+def _received(asking: socket.socket, deadline_s: float) -> tuple[bytes, str] | None:
+    """Return the next datagram and its sender; None when time is up."""
+    while (left_s := deadline_s - time.monotonic()) > 0:
+        asking.settimeout(left_s)
         try:
-            while len(found) < len(addresses):
-                data, (address, _port) = asking.recvfrom(1024)
-                if device := _found(address, data):
-                    found[address] = device
-        except (TimeoutError, ConnectionError):
-            pass  # who hasn't answered by now isn't there
-    return tuple(found.values())
+            data, (address, _port) = asking.recvfrom(1024)
+        except TimeoutError:
+            return None
+        except ConnectionError:  # one address refuses; others may still answer
+            continue
+        return data, address
+    return None
 
 
 def _found(address: str, data: bytes) -> Found | None:
