@@ -31,6 +31,9 @@ class TriggerSource(enum.StrEnum):
     SOFTWARE = "Software"
     LINE0 = "Line0"
     LINE1 = "Line1"
+    LINE2 = "Line2"
+    LINE3 = "Line3"
+    LINE4 = "Line4"
     FREE_RUN = "Off"
 
 
@@ -96,6 +99,9 @@ class CameraCapabilities:
     hardware_timestamp: bool = False
     min_frame_period_s: float = 0.0
     """Shortest time between two frames at the shortest exposure (readout)."""
+    buffered_frames: int = 0
+    """In free run: how many frames may wait that were exposed already. After a pattern is lit so many are thrown
+    away, and the one that is being exposed then."""
 
 
 @dataclass(frozen=True)
@@ -256,6 +262,7 @@ class Camera(Device, Protocol):
     def get_frame(self, timeout_s: float = 2.0) -> Frame:
         """Wait for the oldest frame not yet fetched. The array is the caller's to keep.
 
+        In free run (`TriggerSource.FREE_RUN`) frames come by themselves after `arm`, and `trigger` refuses.
         `timeout_s` counts from the end of the exposure. Raise `DeviceTimeout` when none comes or `abort`
         was called, `IncompleteFrame` when parts are missing, `DeviceDisconnected` when the device is gone.
         """
@@ -401,3 +408,11 @@ class KnowsMirrorTruth(KnowsTruth, Protocol):
     def mirror_truth(self, reference: str) -> MirrorTruth:
         """Return true slopes and heights behind each pixel of the reference camera, in the mirror's frame."""
         ...
+
+
+@runtime_checkable
+class KnowsItsPace(Protocol):
+    """A device that says itself how long its calls may take, beside what they were told to wait."""
+
+    answers_within_s: float
+    """A call that takes longer counts as stuck: its scan ends, with the device's name."""
