@@ -48,6 +48,10 @@ class DeviceTimeout(DeviceError, TimeoutError):
     retryable = True
 
 
+class DeviceStalled(DeviceError):
+    """The driver doesn't return from a call. The scan ends, the rig is opened anew with the next one."""
+
+
 class FeatureError(DeviceError, ValueError):
     """A setting is out of range, not one of the choices, or locked; the sentence names what is allowed."""
 

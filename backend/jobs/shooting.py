@@ -4,8 +4,7 @@ Milliseconds become the devices' microseconds here. A shot that fails for a pass
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
 from typing import TypeVar
@@ -13,9 +12,10 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from backend.devices.errors import DeviceError
+from backend.devices.errors import DeviceError, DeviceStalled
 from backend.devices.protocols import Camera, CameraSettings, Frame, LinkState, Rig
 from backend.jobs.control import JobControl
+from backend.jobs.device_threads import DeviceThreads, aside
 
 ATTEMPTS = 3
 """How often one shot is tried before the rig counts as failed."""
@@ -29,19 +29,18 @@ T = TypeVar("T")
 class Shooter:
     """Software-triggered shots on one rig, from the first to the last of a capturing stage.
 
-    Every camera is used by one thread only, so that cameras expose at the same time and drivers see one
-    thread. Leaving the block disarms the cameras and darkens the projector, whatever happened inside.
+    Every device is used by one thread only, so that cameras expose at the same time and drivers see one
+    thread; a call that doesn't return in time ends the shot (`DeviceStalled`). Leaving the block disarms the cameras and darkens the projector, whatever happened inside.
 
     A projector that runs its own sequence (`SequenceProjector`) can be given whole bursts; that takes another
     class with `load` and a `burst` beside this one, chosen by `CaptureSession`.
     """
 
-    def __init__(self, rig: Rig, control: JobControl) -> None:
+    def __init__(self, rig: Rig, control: JobControl, threads: DeviceThreads | None = None) -> None:
         self._rig = rig
         self._control = control
-        self._threads = {
-            name: ThreadPoolExecutor(1, thread_name_prefix=f"camera-{name}") for name in rig.cameras
-        }
+        self._threads = threads or DeviceThreads((*rig.cameras.values(), rig.projector))
+        self._own_threads = threads is None
         self._asked: dict[str, CameraSettings] = {}
         self._stack = ExitStack()
         self.waited_s = 0.0
@@ -70,7 +69,7 @@ class Shooter:
     def load(self, pictures: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
         """Hand over the patterns of a burst."""
         with self._waiting():
-            self._rig.projector.load(pictures)
+            self._ask_projector("loading patterns", lambda: self._rig.projector.load(pictures))
 
     def take(
         self, index: int, *, exposure_ms: float, gain_db: float, cameras: Sequence[str]
@@ -96,16 +95,17 @@ class Shooter:
                 if not error.retryable or attempt == ATTEMPTS:
                     raise
                 self._asked.clear()
-                self._each(cameras, _disarm)
+                self._each(cameras, "disarming", _disarm)
         raise AssertionError("the last attempt returns or raises")
 
     def _once(
         self, index: int, settings: CameraSettings, cameras: Sequence[str]
     ) -> dict[str, Frame]:
         with self._waiting():
-            self._each(cameras, lambda camera: self._prepare(camera, settings))
+            self._each(cameras, "arming", lambda camera: self._prepare(camera, settings))
             self._show(index)
-            return self._each(cameras, _expose)
+            wait_s = settings.exposure_us * 1e-6 + FRAME_TIMEOUT_S
+            return self._each(cameras, "taking a picture", _expose, wait_s)
 
     @contextmanager
     def _waiting(self) -> Iterator[None]:
@@ -127,37 +127,47 @@ class Shooter:
             camera.arm()
 
     def _show(self, index: int) -> None:
-        presented = self._rig.projector.show(index)
+        presented = self._ask_projector(
+            "showing a pattern", lambda: self._rig.projector.show(index)
+        )
         refresh_hz = self._rig.projector.capabilities.refresh_hz
         if not presented.confirmed and refresh_hz:
             self._control.pause(1.0 / refresh_hz)
 
-    def _each(self, cameras: Sequence[str], work: Callable[[Camera], T]) -> dict[str, T]:
+    def _ask_projector(self, doing: str, work: Callable[[], T]) -> T:
+        return self._threads.call(self._rig.projector.name, doing, work, control=self._control)
+
+    def _each(
+        self, cameras: Sequence[str], doing: str, work: Callable[[Camera], T], wait_s: float = 0.0
+    ) -> dict[str, T]:
         """Do the same with several cameras at once; raise the first error when all have returned."""
-        futures: Mapping[str, Future[T]] = {
-            name: self._threads[name].submit(work, self._rig.cameras[name]) for name in cameras
-        }
-        errors = [error for future in futures.values() if (error := future.exception())]
-        if errors:
-            raise errors[0]
-        return {name: future.result() for name, future in futures.items()}
+        return self._threads.each(
+            cameras,
+            doing,
+            lambda name: work(self._rig.cameras[name]),
+            control=self._control,
+            wait_s=wait_s,
+        )
 
     def _abort(self) -> None:
+        """Unblock the cameras. Whoever cancels doesn't wait for one that hangs here, too."""
         for camera in self._rig.cameras.values():
-            camera.abort()
+            aside(camera.abort)
 
     def _release(self) -> None:
         try:
-            for name, thread in self._threads.items():
-                thread.submit(_disarm, self._rig.cameras[name]).result()
+            self._each([*self._rig.cameras], "disarming", _disarm)
             if self._rig.projector.state is not LinkState.LOST:
-                self._rig.projector.blank()
+                self._ask_projector("going dark", self._darken)
         except DeviceError:
             # The error that ended the shot says more; the pool opens the rig anew after it.
             return
         finally:
-            for thread in self._threads.values():
-                thread.shutdown()
+            if self._own_threads:
+                self._threads.leave(DeviceStalled(self._rig.name, "the capture is over"), _nothing)
+
+    def _darken(self) -> None:
+        self._rig.projector.blank()
 
 
 def _expose(camera: Camera) -> Frame:
@@ -168,3 +178,7 @@ def _expose(camera: Camera) -> Frame:
 def _disarm(camera: Camera) -> None:
     if camera.state is LinkState.ARMED:
         camera.disarm()
+
+
+def _nothing() -> None:
+    """Leave the device as it is."""

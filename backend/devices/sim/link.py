@@ -8,6 +8,9 @@ from backend.devices.protocols import DeviceInfo, LinkState
 class SimulatedLink(Link):
     """A device's life where opening takes no time."""
 
+    answers_within_s = 600.0
+    """A picture is computed: on a small machine, with kernels that have to be compiled first, that may take minutes."""
+
     def __init__(self, name: str, info: DeviceInfo) -> None:
         super().__init__(name, info)
         self._gone_for_good = False
