@@ -16,6 +16,7 @@ from backend.cli import (
     rigs,
     scanning,
     serving,
+    simulating,
     validating,
 )
 from backend.cli.output import CANCELLED, FAILED
@@ -40,6 +41,7 @@ for group in (
     reflecting,
     reports,
     rigs,
+    simulating,
     validating,
     benchmarking,
 ):

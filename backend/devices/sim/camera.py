@@ -27,7 +27,7 @@ from backend.devices.protocols import (
 from backend.devices.refusals import refuse_impossible, refuse_locked, refuse_trigger
 from backend.devices.sim.clock import Clock
 from backend.devices.sim.link import SimulatedLink
-from backend.devices.sim.renderer import Shown
+from backend.devices.sim.renderer import Light
 
 _READOUT_S = 0.004
 _FORMATS = {"Mono8": 8, "Mono12": 12}
@@ -92,7 +92,7 @@ class CameraOptions(Protocol):
 class Exposure:
     """One frame to be: what was lit, from when, with which settings."""
 
-    shown: Shown
+    shown: Light
     settings: CameraSettings
     start_s: float
     frame_id: int
@@ -123,7 +123,7 @@ class SimulatedCamera(SimulatedLink):
         config: CameraOptions,
         clock: Clock,
         *,
-        look: Callable[[], Shown],
+        look: Callable[[], Light],
         develop: Develop,
         trigger_phase: Callable[[int], float],
     ) -> None:
@@ -222,7 +222,7 @@ class SimulatedCamera(SimulatedLink):
         self._clock.wait_until(self._busy_until_s, self._aborted)
         self._expose(self._look(), self._clock.now_s(), self._trigger_phase(self._next_id))
 
-    def line_edge(self, shown: Shown, time_s: float, shown_us: float) -> None:
+    def line_edge(self, shown: Light, time_s: float, shown_us: float) -> None:
         """Expose on an edge of the trigger line; an edge during an exposure is lost, as on real cameras.
 
         Raises
@@ -241,7 +241,7 @@ class SimulatedCamera(SimulatedLink):
             )
         self._expose(shown, time_s, 0.0)
 
-    def _expose(self, shown: Shown, start_s: float, phase: float) -> None:
+    def _expose(self, shown: Light, start_s: float, phase: float) -> None:
         exposure = Exposure(shown, self._settings, start_s, self._next_id, phase)
         with self._changed:
             self._next_id += 1

@@ -27,3 +27,11 @@ class Clock:
             return
         with self._lock:
             self._virtual_s = max(self._virtual_s, time_s)
+
+
+class MachineClock(Clock):
+    """The machine's own monotonic time, for what happens outside the simulation."""
+
+    def __init__(self) -> None:
+        super().__init__(realtime=True)
+        self._start_s = 0.0

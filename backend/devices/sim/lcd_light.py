@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64, UInt8
 from backend.devices.sim import kernels, lcd_kernels, optics
 from backend.devices.sim.lcd_config import SimulatedLcdConfig
 from backend.devices.sim.reflection import Reflected
+from backend.devices.sim.renderer import Shown
 
 _KEPT = 3
 
@@ -92,6 +93,10 @@ class Panel:
             if len(self._cache) > _KEPT:
                 self._cache.popitem(last=False)
         return self._cache[key]
+
+    def steady(self, shown: Shown) -> Float32[np.ndarray, "h w"]:
+        """Return the luminance of what is there already: a real panel's delay shows in what is shown when."""
+        return self.picture(shown.pattern, shown.pattern, 0.0, shown.number)
 
 
 def light(

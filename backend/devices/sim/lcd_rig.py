@@ -23,12 +23,14 @@ from backend.devices.sim.chains import (
     Curve,
     measured_curve,
 )
-from backend.devices.sim.clock import Clock
+from backend.devices.sim.clock import Clock, MachineClock
 from backend.devices.sim.lcd_config import SimulatedLcdConfig
 from backend.devices.sim.lcd_layout import screen_model
-from backend.devices.sim.lcd_light import Panel, light
+from backend.devices.sim.lcd_light import Panel
+from backend.devices.sim.lcd_light import light as light_of
 from backend.devices.sim.lcd_world import LcdWorld, lcd_world
 from backend.devices.sim.mirrors import check_mirror
+from backend.devices.sim.renderer import Light
 from backend.devices.sim.rig_info import rig_info
 from backend.devices.sim.screen import Lit, SimulatedScreen, share_of_before
 from backend.domain.rig import CameraFacts, Pose, ProjectorFacts, RigCalibration, RigFacts
@@ -55,19 +57,28 @@ create_lcd_rig.options_model = SimulatedLcdConfig  # type: ignore[attr-defined] 
 
 
 class SimulatedLcdRig:
-    """A `Rig` that knows the truth. Rays are followed when the rig is opened: seconds, once per process."""
+    """A `Rig` that knows the truth. Rays are followed when the rig is opened: seconds, once per process.
 
-    def __init__(self, config: SimulatedLcdConfig) -> None:
+    Parameters
+    ----------
+    config
+        Mirror, screen and camera.
+    light
+        What the mirror shows instead of the rig's own screen, e.g. a real monitor that is watched. The rig then
+        keeps the machine's time, `time.monotonic()`.
+    """
+
+    def __init__(self, config: SimulatedLcdConfig, light: Light | None = None) -> None:
         check_mirror(config.scene)
         self.config = config
         self.chain = chain_of(config)
-        self._clock = Clock(realtime=config.realtime)
+        self._clock = Clock(realtime=config.realtime) if light is None else MachineClock()
         self._screen = SimulatedScreen(config, self._clock)
         self._camera = SimulatedCamera(
             NAME,
             config,
             self._clock,
-            look=lambda: self._screen.shown,
+            look=lambda: light or self._screen.shown,
             develop=self._develop,
             trigger_phase=lambda frame_id: 0.0,
         )
@@ -162,11 +173,9 @@ class SimulatedLcdRig:
             return self._world
 
     def _develop(self, exposure: Exposure) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
-        shown = exposure.shown
-        assert isinstance(shown, Lit), "the screen shows nothing else"
-        defect = self._defect(shown.pattern)
+        defect = self._defect(exposure)
         picture = self._picture(
-            light(self._load().footprints, self._shown(exposure, shown), self.config.lens_blur_px),
+            light_of(self._load().footprints, self._shown(exposure), self.config.lens_blur_px),
             exposure,
             {"dropped": 0.0, "dimmed": _DIMMED}.get(defect, 1.0),
         )
@@ -175,14 +184,22 @@ class SimulatedLcdRig:
         self._last = picture
         return picture
 
-    def _defect(self, pattern: UInt8[np.ndarray, "h w"]) -> str:
+    def _defect(self, exposure: Exposure) -> str:
         """Return what is wrong with this frame; empty: nothing."""
-        if self.config.defect_frame is None or pattern.min() == pattern.max():
+        if self.config.defect_frame is None:
+            return ""
+        pattern = exposure.shown.during(exposure.start_s, exposure.end_s)[-1][0].pattern
+        if pattern.min() == pattern.max():
             return ""
         self._patterned += 1
         return self.config.defect if self._patterned == self.config.defect_frame + 1 else ""
 
-    def _shown(self, exposure: Exposure, shown: Lit) -> Float32[np.ndarray, "hs ws"]:
+    def _shown(self, exposure: Exposure) -> Float32[np.ndarray, "hs ws"]:
+        shown = exposure.shown
+        if not isinstance(shown, Lit):
+            parts = shown.during(exposure.start_s, exposure.end_s)
+            pictures = [np.float32(share) * self._panel.steady(one) for one, share in parts]
+            return np.asarray(np.sum(pictures, axis=0), np.float32)
         before = share_of_before(
             shown.since_s,
             1e-3 * self.config.response_ms,

@@ -1,8 +1,10 @@
 """From a projected pattern to the light on a camera's pixels."""
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import Lock
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -21,6 +23,23 @@ class Shown:
     number: int
     """Counts everything ever shown; the cache's key."""
 
+    def during(self, start_s: float, end_s: float) -> tuple[tuple["Shown", float], ...]:
+        """Return itself: it stays until the exposure is over."""
+        del start_s, end_s
+        return ((self, 1.0),)
+
+
+@runtime_checkable
+class Light(Protocol):
+    """What lights the scene: a pattern that stays for the whole exposure, or a display that is watched meanwhile."""
+
+    def during(self, start_s: float, end_s: float) -> Sequence[tuple[Shown, float]]:
+        """Return what was shown between two times of the rig's clock, each with its share of that time.
+
+        Called when the exposure is over. The shares add up to 1.
+        """
+        ...
+
 
 class Beam:
     """The projector's light, shared by the cameras: blurred pictures, computed once per pattern."""
@@ -36,12 +55,24 @@ class Beam:
         self._lock = Lock()
 
     def pictures(
+        self, shown: Sequence[tuple[Shown, float]], exposure_ms: float, phase: float
+    ) -> Float32[np.ndarray, "2 h w"]:
+        """Return the light of patterns during an exposure, in focus and at the largest defocus.
+
+        `shown` are the patterns with their shares of the exposure; `phase` is where in its period the
+        projector is when the exposure begins, in [0, 1).
+        """
+        pictures = [(self._pictures(one, exposure_ms, phase), share) for one, share in shown]
+        if len(pictures) == 1:
+            return pictures[0][0]
+        mixed = np.zeros_like(pictures[0][0])
+        for picture, share in pictures:
+            mixed += np.float32(share) * picture
+        return mixed
+
+    def _pictures(
         self, shown: Shown, exposure_ms: float, phase: float
     ) -> Float32[np.ndarray, "2 h w"]:
-        """Return the light of a pattern during an exposure, in focus and at the largest defocus.
-
-        `phase` is where in its period the projector is when the exposure begins, in [0, 1).
-        """
         if self._period_ms is not None and not refresh.whole_periods(exposure_ms, self._period_ms):
             light = refresh.light_during(self._mean, exposure_ms, self._period_ms, phase)
             return self._blurred(shown.pattern, light)

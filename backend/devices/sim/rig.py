@@ -11,12 +11,12 @@ from backend.devices.opening import open_all
 from backend.devices.options import read_options
 from backend.devices.protocols import Camera, DeviceInfo
 from backend.devices.sim.camera import Exposure, SimulatedCamera
-from backend.devices.sim.clock import Clock
+from backend.devices.sim.clock import Clock, MachineClock
 from backend.devices.sim.config import SimulatedRigConfig
 from backend.devices.sim.layout import layout, relative
 from backend.devices.sim.optics import veil
 from backend.devices.sim.projector import SimulatedProjector
-from backend.devices.sim.renderer import Beam, LightPaths, light_paths
+from backend.devices.sim.renderer import Beam, Light, LightPaths, light_paths
 from backend.devices.sim.rig_info import rig_info
 from backend.devices.sim.scenes import check_name
 from backend.devices.sim.sensor import Sensor
@@ -46,20 +46,29 @@ create_rig.options_model = SimulatedRigConfig  # type: ignore[attr-defined]  # r
 
 
 class SimulatedRig:
-    """A `Rig` that knows the truth. The scene is cast when the rig is opened: seconds, once per process."""
+    """A `Rig` that knows the truth. The scene is cast when the rig is opened: seconds, once per process.
 
-    def __init__(self, config: SimulatedRigConfig) -> None:
+    Parameters
+    ----------
+    config
+        What stands before it, and how it is built.
+    light
+        What lights the scene instead of the rig's own projector, e.g. a real monitor that is watched. The rig
+        then keeps the machine's time, `time.monotonic()`.
+    """
+
+    def __init__(self, config: SimulatedRigConfig, light: Light | None = None) -> None:
         check_name(config.scene)
         self.config = config
         self._layout = layout(config)
-        self._clock = Clock(realtime=config.realtime)
+        self._clock = Clock(realtime=config.realtime) if light is None else MachineClock()
         self._projector = SimulatedProjector(config, self._clock)
         self._cameras = {
             name: SimulatedCamera(
                 name,
                 config,
                 self._clock,
-                look=lambda: self._projector.shown,
+                look=lambda: light or self._projector.shown,
                 develop=partial(self._develop, name),
                 trigger_phase=partial(self._phase, index),
             )
@@ -163,7 +172,8 @@ class SimulatedRig:
         self._load()
         assert self._beam is not None
         exposure_ms = exposure.settings.exposure_us * 1e-3
-        pictures = self._beam.pictures(exposure.shown, exposure_ms, exposure.phase)
+        shown = exposure.shown.during(exposure.start_s, exposure.end_s)
+        pictures = self._beam.pictures(shown, exposure_ms, exposure.phase)
         rate = self._paths[camera].light(
             pictures,
             white_e_per_ms=self.config.white_e_per_ms,

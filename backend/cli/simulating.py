@@ -1,0 +1,85 @@
+"""`unglare simulate-hardware`: cameras on the network that look at a monitor of this machine."""
+
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from backend.cli.options import RigOptions, Scene, Seed, Size, parse_rig_options
+from backend.cli.output import quiet_logging
+
+_FIRST_HOST = 2
+
+
+def register(application: typer.Typer) -> None:
+    """Add the commands of this module."""
+    application.command("simulate-hardware")(simulate_hardware)
+
+
+def simulate_hardware(
+    scene: Scene = None,
+    size: Size = None,
+    seed: Seed = None,
+    rig_options: RigOptions = None,
+    address: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Address of a camera; once for each.  [default: 127.0.0.2, 127.0.0.3]",
+            show_default=False,
+        ),
+    ] = None,
+    monitor: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of the monitor that the cameras look at, as `unglare projector --list` shows; else the last one.",
+        ),
+    ] = None,
+    write_rig: Annotated[
+        Path | None,
+        typer.Option(help="Write the rig file that goes with it: `unglare rigs add FILE`."),
+    ] = None,
+    page: Annotated[
+        str, typer.Option(help="Name of the projector page in the rig file.")
+    ] = "projector",
+    lag_ms: Annotated[
+        float,
+        typer.Option(
+            min=0, max=2000, help="So much later than on the monitor everything comes to light."
+        ),
+    ] = 0.0,
+    packet_loss: Annotated[
+        float, typer.Option(min=0, max=0.5, help="Share of the cameras' packets that get lost.")
+    ] = 0.0,
+) -> None:
+    """Simulate a rig's hardware: GigE Vision cameras that see what a monitor shows, lit onto a scene.
+
+    The projector page on that monitor is the projector; everything between is the real thing. Ends with Ctrl+C.
+    """
+    from backend.devices.loading import DEFAULT_METHOD, rig_for
+    from backend.services.kiosk import Kiosk, listed_monitors
+    from backend.services.simulated_hardware import Hardware, SimulatedHardware, until_interrupted
+
+    quiet_logging()
+    options = parse_rig_options(rig_options, scene=scene, size=size, seed=seed)
+    rig = rig_for(scene, DEFAULT_METHOD)
+    count = 1 if rig == "sim-lcd" else int(options.get("cameras", 2))
+    hardware = Hardware(
+        rig=rig,
+        options=options,
+        addresses=address or [f"127.0.0.{_FIRST_HOST + n}" for n in range(count)],
+        monitor=Kiosk.choose(listed_monitors(), monitor),
+        lag_ms=lag_ms,
+        packet_loss=packet_loss,
+        seed=seed or 0,
+        page=page,
+    )
+    with closing(SimulatedHardware(hardware)) as simulated, suppress(KeyboardInterrupt):
+        if write_rig is not None:
+            simulated.write_rig(write_rig)
+            typer.echo(f"The rig file is {write_rig}; keep it: unglare rigs add {write_rig}")
+        for process in simulated.peers:
+            typer.echo(f"Camera {process.peer.camera} answers at {process.peer.address}.")
+        typer.echo(f"They look at monitor {hardware.monitor}. Stop with Ctrl+C.")
+        simulated.run(until_interrupted)

@@ -1,0 +1,144 @@
+"""Cameras of a simulated rig on the network, a process each: rendering one never delays the other's packets."""
+
+import errno
+import multiprocessing
+import signal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from typing import Any
+
+from backend.devices.options import read_options
+from backend.devices.peers.gige_camera import GigECamera, Wire
+from backend.devices.sim import (
+    SimulatedLcdConfig,
+    SimulatedLcdRig,
+    SimulatedRig,
+    SimulatedRigConfig,
+)
+from backend.devices.sim.renderer import Light
+from backend.domain.errors import StartupError, UnglareError
+
+_START_S = 300.0
+"""So long a large scene may take to be cast."""
+_END_S = 5.0
+
+
+@dataclass(frozen=True)
+class Peer:
+    """One camera to be: which, of what rig, where."""
+
+    rig: str
+    """`simulated` or `sim-lcd`."""
+    options: Mapping[str, Any]
+    camera: str
+    address: str
+    wire: Wire
+
+
+def make_rig(name: str, options: Mapping[str, Any], light: Light) -> SimulatedRig | SimulatedLcdRig:
+    """Make a simulated rig that something outside lights; nothing is opened yet.
+
+    Raises
+    ------
+    RigConfigError
+        If an option is unknown or can't be used.
+    """
+    if name == "sim-lcd":
+        return SimulatedLcdRig(read_options(SimulatedLcdConfig, "simulated rig", options), light)
+    return SimulatedRig(read_options(SimulatedRigConfig, "simulated rig", options), light)
+
+
+class PeerProcess:
+    """A process that serves one camera; it ends with this object's `stop`, and with the process that made it."""
+
+    def __init__(self, peer: Peer, light: Light) -> None:
+        self.peer = peer
+        context = multiprocessing.get_context("spawn")
+        self._told, theirs = context.Pipe()
+        self._process: SpawnProcess = context.Process(
+            target=_serve, args=(peer, light, theirs), name=f"camera-{peer.camera}", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+
+    def wait_until_ready(self) -> None:
+        """Wait until the camera answers.
+
+        Raises
+        ------
+        StartupError
+            If it can't: the address is taken, or the scene can't be made.
+        """
+        problem = f"it isn't ready after {_START_S:g} s; choose a smaller size"
+        try:
+            if self._told.poll(_START_S):
+                problem = self._told.recv()
+        except EOFError:
+            problem = "its process ended at once; look at what it wrote"
+        if problem:
+            raise StartupError(
+                f"The simulated camera {self.peer.camera} at {self.peer.address} can't start: {problem}"
+            )
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the camera is served still."""
+        return self._process.is_alive()
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process."""
+        return self._process.pid
+
+    def kill(self) -> None:
+        """End it as a power cut would."""
+        self._process.kill()
+        self._process.join()
+
+    def stop(self) -> None:
+        """Take the camera off the network; any number of times."""
+        self._told.close()
+        self._process.join(_END_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+
+def _serve(peer: Peer, light: Light, told: Connection) -> None:
+    """Serve until the other end of the pipe is closed."""
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl+C is for who started this, and ends it in order
+    try:
+        rig = make_rig(peer.rig, peer.options, light)
+        with rig, GigECamera(rig.cameras[peer.camera], peer.address, peer.wire):
+            told.send("")
+            _wait_for_end(told)
+    except UnglareError as error:
+        _tell(told, error.sentence)
+    except OSError as error:
+        _tell(told, _address_problem(error))
+
+
+def _wait_for_end(told: Connection) -> None:
+    try:
+        told.recv()
+    except (EOFError, OSError):
+        return
+
+
+def _tell(told: Connection, problem: str) -> None:
+    try:
+        told.send(problem)
+    except OSError:
+        return  # whoever started this is gone
+
+
+def _address_problem(error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return "another camera has this address; stop that one, or choose another with --address"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return "this machine hasn't got this address; choose one of 127.0.0.0/8 with --address"
+    return f"{error.strerror or error}; choose another address with --address"
