@@ -50,7 +50,7 @@ class DriverThread:
         self._work: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = (
             queue.SimpleQueue()
         )
-        self._waiting: set[Future[Any]] = set()
+        self._open: set[Future[Any]] = set()
         self._thread: threading.Thread | None = None
         self._left: Exception | None = None
 
@@ -65,26 +65,25 @@ class DriverThread:
         return future
 
     def leave(self, error: Exception, last: Callable[[], None] | None = None) -> "Future[None]":
-        """Take no more work, and fail what is queued with an error.
+        """Take no more work; what is queued, and what runs, fails with an error at once.
 
-        `last` is still called, after the call that runs now; the returned future tells when that is over.
+        `last` is still called, when the call that runs now returns; the returned future tells when that is over.
         """
         ended: Future[None] = Future()
         with self._lock:
-            queued, self._waiting = self._waiting, set()
-            for future in queued:
-                if future.set_running_or_notify_cancel():
-                    future.set_exception(error)
+            failed, self._open = self._open, set()
             if self._left is not None or (self._thread is None and last is None):
                 ended.set_result(None)
             else:
                 self._queue(ended, last or _nothing)
                 self._work.put(None)
             self._left = self._left or error
+        for future in failed:
+            future.set_exception(error)
         return ended
 
     def _queue(self, future: "Future[T]", work: Callable[[], T]) -> None:
-        self._waiting.add(future)
+        self._open.add(future)
         self._work.put((future, work))
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
@@ -92,22 +91,26 @@ class DriverThread:
 
     def _run(self) -> None:
         while (item := self._work.get()) is not None:
-            future, work = item
-            with self._lock:
-                mine = future in self._waiting and future.set_running_or_notify_cancel()
-                self._waiting.discard(future)
-            if mine:
-                _carry_out(future, work)
-            del item, future, work  # or the last call's frame stays in memory until the next one
+            if item[0] in self._open:
+                self._carry_out(*item)
+            del item  # or the last call's frame stays in memory until the next one
 
+    def _carry_out(self, future: "Future[T]", work: Callable[[], T]) -> None:
+        try:
+            result = work()
+        except BaseException as error:  # noqa: BLE001  whoever waits for the future gets it
+            if self._is_awaited(future):
+                future.set_exception(error)
+        else:
+            if self._is_awaited(future):
+                future.set_result(result)
 
-def _carry_out(future: "Future[T]", work: Callable[[], T]) -> None:
-    try:
-        result = work()
-    except BaseException as error:  # noqa: BLE001  whoever waits for the future gets it
-        future.set_exception(error)
-    else:
-        future.set_result(result)
+    def _is_awaited(self, future: "Future[Any]") -> bool:
+        """Tell whether a call's end is news still: not if the thread was left meanwhile."""
+        with self._lock:
+            awaited = future in self._open
+            self._open.discard(future)
+        return awaited
 
 
 def _nothing() -> None:

@@ -25,10 +25,12 @@ from backend.domain.states import JobStatus, Level, Verdict
 from backend.jobs.calibrations import hand_over
 from backend.jobs.capture import CaptureSession
 from backend.jobs.control import JobControl, Live
+from backend.jobs.device_threads import DeviceThreads
 from backend.jobs.journal import DatabaseJournal
+from backend.jobs.live import LivePicture
 from backend.jobs.loading import NO_RIG, LoadedScan, load_inputs, load_scan
 from backend.jobs.plan import Gate, PlannedStage, next_step
-from backend.jobs.rigs import LivePicture, Owner, RigGiven, RigPool
+from backend.jobs.rigs import Owner, RigGiven, RigPool
 from backend.jobs.shooting import Shooter
 from backend.jobs.stage_work import (
     Outcome,
@@ -239,15 +241,23 @@ class JobExecution:
             result = self._drive(None, planned, scan, task)
         else:
             owner = Owner(scan.row.id, scan.title, self._job.who)
-            with self._shop.rigs.lease(scan.row.rig, scan.row.rig_options, owner) as lease:
-                result, device = lease.call(lambda rig: self._shoot(rig, planned, scan, task))
+            rigs, row = self._shop.rigs, scan.row
+            with rigs.lease(row.rig, row.rig_options, owner, self.control) as lease:
+                result, device = lease.call(
+                    lambda rig: self._shoot(rig, lease.threads, planned, scan, task)
+                )
         with stage_errors(stage):
             return replace(conclude(stage, result, params, self._shop.store), device=device)
 
     def _shoot(
-        self, rig: Rig, planned: PlannedStage, scan: LoadedScan, task: StageTask
+        self,
+        rig: Rig,
+        threads: DeviceThreads,
+        planned: PlannedStage,
+        scan: LoadedScan,
+        task: StageTask,
     ) -> tuple[Any, dict[str, Any]]:
-        with Shooter(rig, self.control) as shooter:
+        with Shooter(rig, self.control, threads) as shooter:
             result = self._drive(shooter, planned, scan, task)
         return result, _devices(rig, shooter.waited_s)
 
@@ -284,7 +294,7 @@ class JobExecution:
     def _seen(
         self, scan: LoadedScan, camera: str, frame: DeviceFrame, row: FrameRow | None
     ) -> None:
-        self._shop.rigs.show(scan.row.rig, camera, LivePicture(frame.data, frame.bits))
+        self._shop.rigs.show(scan.row.rig, camera, LivePicture.of(frame))
         if row is not None:
             self._shop.publish(
                 FrameCaptured(

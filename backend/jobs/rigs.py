@@ -1,30 +1,42 @@
 """The rigs in use: opened when first needed, used by one thread each, lent to one capture at a time."""
 
-import itertools
 import json
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import numpy as np
-
 from backend.contract.events import Event, RigChanged
+from backend.contract.rigs import RigLink
 from backend.devices.errors import DeviceError
-from backend.devices.protocols import LinkState, Rig
-from backend.domain.errors import RigBusyError, RigFailedError
-from backend.domain.patterns import WHITE
+from backend.devices.protocols import (
+    CameraCapabilities,
+    Device,
+    DeviceInfo,
+    LinkState,
+    ProjectorCapabilities,
+    Rig,
+)
+from backend.domain.errors import RigBusyError, RigFailedError, UnglareError
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.jobs.control import JobControl
-from backend.jobs.rendering import render
-from backend.jobs.shooting import Shooter
+from backend.jobs.device_threads import DeviceThreads
+from backend.jobs.live import LiveBench, LivePicture, LiveWish
+from backend.jobs.rig_thread import CLOSING, OPENING, RigThread, wait_for
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+_CLOSING_S = 15.0
+"""How long the application waits for its rigs when it ends."""
+
+LIVE_HOLD_S = 3.0
+"""So long pictures stay live after somebody has asked for them."""
 
 OpenRig = Callable[[str, Mapping[str, Any]], Rig]
 """Makes a rig of its name and options, see `backend.devices.loading.open_rig`."""
@@ -35,8 +47,14 @@ class Owner:
     """Who captures with a rig."""
 
     scan: str
+    """Id of the scan; empty: other work, which `scan_name` names."""
     scan_name: str
     who: str
+
+    @property
+    def doing(self) -> str:
+        """What he does, as half a sentence."""
+        return f"captures scan {self.scan_name!r}" if self.scan else f"runs the {self.scan_name}"
 
 
 @dataclass(frozen=True)
@@ -48,13 +66,34 @@ class RigGiven:
 
 
 @dataclass(frozen=True)
-class LivePicture:
-    """The newest picture of a camera; never stored."""
+class KnownDevice:
+    """A device of an open rig, as it was when it was asked last: looking at it never waits for the device."""
 
-    gray: np.ndarray[Any, np.dtype[Any]]
-    bit_depth: int
-    number: int = field(default_factory=itertools.count().__next__)
-    """Tells two pictures apart."""
+    device: Device
+    info: DeviceInfo
+    capabilities: CameraCapabilities | ProjectorCapabilities
+
+    @property
+    def link(self) -> LinkState:
+        """Where it is in its life now."""
+        return self.device.state
+
+
+@dataclass(frozen=True)
+class RigStatus:
+    """How a rig is doing just now."""
+
+    link: RigLink
+    options: Mapping[str, Any] | None
+    """Those that it is open with, or was last; None: never opened."""
+    owner: Owner | None
+    failure: str | None
+    """Why it couldn't be opened, or why no live picture came; None: all is well."""
+    devices: tuple[KnownDevice, ...]
+    is_live: bool
+    """Somebody looks at live pictures."""
+    wish: LiveWish | None
+    """How they are taken."""
 
 
 class Lease:
@@ -62,6 +101,11 @@ class Lease:
 
     def __init__(self, slot: "_Slot") -> None:
         self._slot = slot
+
+    @property
+    def threads(self) -> DeviceThreads:
+        """The threads of the opened rig's devices."""
+        return self._slot.threads
 
     def call(self, work: Callable[[Rig], T]) -> T:
         """Run something on the rig's own thread and wait for it."""
@@ -72,7 +116,8 @@ class RigPool:
     """All rigs of this process.
 
     There is one rig per name: the same name with other options closes the old one first, as hardware can't be
-    opened twice. A rig that failed is closed and opened anew by the next one who needs it.
+    opened twice. A rig that failed is closed and opened anew by the next one who needs it; one whose driver never
+    returns is left behind for that.
 
     Parameters
     ----------
@@ -125,8 +170,14 @@ class RigPool:
         return slot.opened(options, work).result()
 
     @contextmanager
-    def lease(self, name: str, options: Mapping[str, Any], owner: Owner) -> Iterator[Lease]:
-        """Own a rig for one capture.
+    def lease(
+        self,
+        name: str,
+        options: Mapping[str, Any],
+        owner: Owner,
+        control: JobControl | None = None,
+    ) -> Iterator[Lease]:
+        """Own a rig for one capture; the job behind `control` may be cancelled while the rig is opened.
 
         Raises
         ------
@@ -136,12 +187,13 @@ class RigPool:
         slot = self._slot(name)
         slot.take(owner)
         try:
-            slot.opened(options, lambda rig: None, leased=True).result()
+            wait_for(slot.opened(options, lambda rig: None, leased=True), control)
             yield Lease(slot)
         except (RigFailedError, DeviceError):
             slot.discard().result()
             raise
         finally:
+            slot.leave_stuck()
             slot.give_back()
 
     def owner(self, name: str) -> Owner | None:
@@ -158,22 +210,74 @@ class RigPool:
         self._slot(name).live[camera] = picture
 
     def live(self, name: str, camera: str) -> LivePicture | None:
-        """Return the newest picture of a camera; never waits.
+        """Return the newest picture of a camera; never waits, and asks for nothing."""
+        slot = self._slots.get(name)
+        return slot.live.get(camera) if slot else None
 
-        Where nobody captures, a new one is asked for: the next call finds it.
-        """
+    # a rig without a scan: everything here returns at once
+
+    def status(self, name: str) -> RigStatus:
+        """Tell how a rig is doing; one that was never opened is closed."""
         slot = self._slots.get(name)
         if slot is None:
-            return None
-        slot.ask_for_picture()
-        return slot.live.get(camera)
+            return RigStatus(RigLink.CLOSED, None, None, None, (), is_live=False, wish=None)
+        return slot.status()
+
+    def connect(self, name: str, options: Mapping[str, Any]) -> None:
+        """Have a rig opened, in the background; an open one stays as it is, whatever its options.
+
+        `status` tells when it is open, or why it couldn't be opened.
+        """
+        self._slot(name).connect(options)
+
+    def disconnect(self, name: str) -> None:
+        """Have the devices of a rig closed, so that another program can use them.
+
+        Raises
+        ------
+        RigBusyError
+            If a capture owns the rig.
+        """
+        with self._lock:
+            slot = self._slots.get(name)
+        if slot is not None:
+            slot.disconnect()
+
+    def reconnect(self, name: str, options: Mapping[str, Any] | None = None) -> None:
+        """Have a rig closed and opened again; None: with the options that it had.
+
+        Raises
+        ------
+        RigBusyError
+            If a capture owns the rig.
+        """
+        slot = self._slot(name)
+        slot.refuse_busy()
+        known = slot.status().options
+        slot.disconnect()
+        slot.connect(options if options is not None else known or {}, anew=True)
+
+    def wish(self, name: str, wish: LiveWish) -> None:
+        """Say how the next live pictures are taken."""
+        self._slot(name).wish = wish
+
+    def watch(self, name: str) -> None:
+        """Ask for live pictures for the next `LIVE_HOLD_S`: taken while the rig is open and nobody captures."""
+        slot = self._slots.get(name)
+        if slot is not None:
+            slot.watch()
+
+    def rest(self, name: str) -> None:
+        """End live pictures at once: cameras disarmed, projector dark."""
+        slot = self._slots.get(name)
+        if slot is not None:
+            slot.rest()
 
     def close(self) -> None:
         """Give all rigs back."""
         with self._lock:
             slots, self._slots = list(self._slots.values()), {}
-        for slot in slots:
-            slot.close()
+        wait([slot.discard() for slot in slots], timeout=_CLOSING_S)
 
     def _slot(self, name: str) -> "_Slot":
         with self._lock:
@@ -198,18 +302,46 @@ class _Slot:
         self.name = name
         self._tell_opened = opened
         self.live: dict[str, LivePicture] = {}
+        self.wish: LiveWish | None = None
         self._open_rig = open_rig
         self._publish = publish
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"rig-{name}")
+        self._thread = RigThread(name, self._forget)
+        self._threads: DeviceThreads | None = None
         self._lock = threading.Lock()
         self._owner: Owner | None = None
         self._rig: Rig | None = None
         self._options: str | None = None
+        self._asked_options: Mapping[str, Any] | None = None
+        self._devices: tuple[KnownDevice, ...] = ()
+        self._link = RigLink.CLOSED
+        self._failure: str | None = None
+        self._bench: LiveBench | None = None
         self._picture: Future[None] | None = None
+        self._wanted_until_s = 0.0
+        self._watching: threading.Timer | None = None
 
     @property
     def owner(self) -> Owner | None:
         return self._owner
+
+    @property
+    def threads(self) -> DeviceThreads:
+        """The threads of the opened rig's devices."""
+        threads = self._threads
+        if threads is None:
+            raise self._closed_meanwhile()
+        return threads
+
+    def status(self) -> RigStatus:
+        return RigStatus(
+            link=self._link,
+            options=self._asked_options,
+            owner=self._owner,
+            failure=self._failure,
+            devices=self._devices,
+            is_live=self._is_wanted(),
+            wish=self.wish,
+        )
 
     def take(self, owner: Owner) -> None:
         with self._lock:
@@ -226,8 +358,7 @@ class _Slot:
         owner = self._owner
         if owner is not None:
             raise RigBusyError(
-                f"Rig {self.name!r} is busy: {owner.who} captures scan {owner.scan_name!r}; "
-                f"wait until that is done or cancel it.",
+                f"Rig {self.name!r} is busy: {owner.who} {owner.doing}; wait until that is done or cancel it.",
                 details={"scan": owner.scan, "who": owner.who},
             )
 
@@ -260,6 +391,8 @@ class _Slot:
         def open_and_work() -> T:
             if not leased:
                 self.refuse_other(options)
+            else:
+                self._end_live()
             self._open(options, made)
             return work(self._opened_rig())
 
@@ -268,63 +401,188 @@ class _Slot:
     def discard(self) -> Future[None]:
         return self._thread.submit(self._close)
 
-    def close(self) -> None:
-        self.discard().result()
-        self._thread.shutdown()
+    def leave_stuck(self) -> None:
+        """Leave the rig behind if a call into one of its drivers is stuck."""
+        self._thread.submit(self._leave_if_stuck).result()
 
-    def ask_for_picture(self) -> None:
+    def connect(self, options: Mapping[str, Any], *, anew: bool = False) -> None:
+        with self._lock:
+            if self._link in (RigLink.OPEN, RigLink.OPENING) and not anew:
+                return
+            self._link = RigLink.OPENING
+            self._asked_options = dict(options)
+        opening = self._thread.submit(lambda: self._open(options, None))
+        opening.add_done_callback(self._note_failure)
+        self._publish(RigChanged(rig=self.name))
+
+    def disconnect(self) -> None:
+        with self._lock:
+            self.refuse_busy()
+            rig = self._rig
+            self._failure = None
+            self._wanted_until_s = 0.0
+            if rig is not None:
+                self._link = RigLink.CLOSING
+        if rig is not None:
+            # Whoever waits for a picture stops waiting. Beside us: a driver may take its time even for that.
+            threading.Thread(target=_abort, args=(rig,), daemon=True).start()
+        self.discard()
+        self._publish(RigChanged(rig=self.name))
+
+    def watch(self) -> None:
+        with self._lock:
+            was_wanted = self._is_wanted()
+            self._wanted_until_s = time.monotonic() + LIVE_HOLD_S
+            if self._watching is None:
+                self._look_again(LIVE_HOLD_S)
+        if not was_wanted:
+            self._publish(RigChanged(rig=self.name))
+        self._ask_for_picture()
+
+    def rest(self) -> None:
+        self._wanted_until_s = 0.0
+        self._thread.submit(self._end_live)
+        self._publish(RigChanged(rig=self.name))
+
+    def _is_wanted(self) -> bool:
+        return time.monotonic() < self._wanted_until_s
+
+    def _ask_for_picture(self) -> None:
         with self._lock:
             waiting = self._picture is not None and not self._picture.done()
-            if self._rig is None or self._owner is not None or waiting:
+            if self._link is not RigLink.OPEN or self._owner is not None or waiting:
                 return
             self._picture = self._thread.submit(self._take_picture)
 
+    def _look_again(self, later_s: float) -> None:
+        self._watching = threading.Timer(later_s, self._look)
+        self._watching.daemon = True
+        self._watching.start()
+
+    def _look(self) -> None:
+        """See whether somebody still wants pictures; if nobody does, end them."""
+        with self._lock:
+            left_s = self._wanted_until_s - time.monotonic()
+            if left_s > 0:
+                self._look_again(left_s + 0.01)
+                return
+            self._watching = None
+        self.rest()
+
+    def _note_failure(self, opening: "Future[None]") -> None:
+        """Keep why a rig couldn't be opened for those who look."""
+        error = opening.exception()
+        if isinstance(error, UnglareError):
+            self._failure = error.sentence
+        elif error is not None:
+            # A plug-in may raise anything.
+            log.error("Rig %r can't be opened.", self.name, exc_info=error)
+            self._failure = (
+                f"Rig {self.name!r} failed with {type(error).__name__}: {error}; see the log."
+            )
+        self._publish(RigChanged(rig=self.name))
+
     # on the rig's thread
+
+    def _closed_meanwhile(self) -> RigFailedError:
+        return RigFailedError(f"Rig {self.name!r} was closed in the meantime: run again.")
 
     def _opened_rig(self) -> Rig:
         if self._rig is None:
-            raise RigFailedError(f"Rig {self.name!r} was closed in the meantime: run again.")
+            raise self._closed_meanwhile()
         return self._rig
 
     def _open(self, options: Mapping[str, Any], made: Rig | None) -> None:
         if self._rig is not None and self.holds(options) and _is_healthy(self._rig):
+            self._link = RigLink.OPEN
             return
         self._close()
-        rig = made or self._open_rig(self.name, options)
-        rig.open()
+        self._link, self._asked_options = RigLink.OPENING, dict(options)
+        try:
+            self._open_anew(made or self._open_rig(self.name, options), options)
+        except BaseException:
+            self._link = RigLink.CLOSED
+            raise
+        self._link, self._failure = RigLink.OPEN, None
+        self._publish(RigChanged(rig=self.name))
+
+    def _open_anew(self, rig: Rig, options: Mapping[str, Any]) -> None:
+        with self._thread.beside_what_is_stuck(), self._thread.limited(rig, OPENING):
+            rig.open()
         try:
             self._tell_opened(self.name, _canonical(options), rig)
+            self._devices = _known(rig)
         except BaseException:
             rig.close()
             raise
+        self._threads = DeviceThreads(known.device for known in self._devices)
         self._rig, self._options = rig, _canonical(options)
-        self._publish(RigChanged(rig=self.name))
 
     def _close(self) -> None:
-        if self._rig is None:
+        rig, threads = self._rig, self._threads
+        if rig is None or threads is None:
+            self._link = RigLink.CLOSED
             return
-        self._rig.close()
-        self._rig, self._options = None, None
+        self._link = RigLink.CLOSING
+        if self._leave_if_stuck():
+            return
+        self._end_live()
+        if self._leave_if_stuck():
+            return
+        threads.leave(self._closed_meanwhile(), _nothing)
+        with self._thread.limited(rig, CLOSING):
+            rig.close()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Know no rig any more: it is closed, or left behind."""
+        self._rig, self._options, self._threads, self._devices = None, None, None, ()
+        self._bench, self._link = None, RigLink.CLOSED
         self.live.clear()
         self._publish(RigChanged(rig=self.name))
 
+    def _leave_if_stuck(self) -> bool:
+        rig, threads = self._rig, self._threads
+        return rig is not None and threads is not None and self._thread.leave_stuck(rig, threads)
+
     def _take_picture(self) -> None:
-        rig = self._rig
-        if rig is None or self._owner is not None:
+        rig, wish = self._rig, self.wish
+        if rig is None or wish is None or self._owner is not None or not self._is_wanted():
             return
+        if not _is_healthy(rig):
+            return  # it has to be reconnected; its devices' states say so
+        if self._bench is None:
+            # Asked again: a page measures its monitor's refresh rate when it has one.
+            self._bench, self._devices = LiveBench(rig, self.threads), _known(rig)
         try:
-            with Shooter(rig, JobControl()) as shooter:
-                width_px, height_px = shooter.projector_size
-                shooter.load([render(WHITE, width_px=width_px, height_px=height_px)])
-                exposure_us = next(iter(rig.cameras.values())).settings.exposure_us
-                frames = shooter.take(
-                    0, exposure_ms=exposure_us / 1000.0, gain_db=0.0, cameras=list(rig.cameras)
-                )
-        except DeviceError as error:
-            log.warning("No live picture of rig %r: %s", self.name, error)
-            return
-        for name, frame in frames.items():
-            self.live[name] = LivePicture(frame.data, frame.bits)
+            self.live.update(self._bench.take(wish))
+        except UnglareError as error:
+            if error.sentence != self._failure:
+                log.warning("No live picture of rig %r: %s", self.name, error)
+            self._failure = error.sentence
+            self._leave_if_stuck()
+        else:
+            self._failure = None
+
+    def _end_live(self) -> None:
+        bench, self._bench = self._bench, None
+        if bench is not None:
+            bench.rest()
+
+
+def _nothing() -> None:
+    """Nothing is stuck that it could be called behind."""
+
+
+def _abort(rig: Rig) -> None:
+    for camera in rig.cameras.values():
+        camera.abort()
+
+
+def _known(rig: Rig) -> tuple[KnownDevice, ...]:
+    cameras = [KnownDevice(c, c.info, c.capabilities) for c in rig.cameras.values()]
+    projector = rig.projector
+    return (*cameras, KnownDevice(projector, projector.info, projector.capabilities))
 
 
 def _is_healthy(rig: Rig) -> bool:
