@@ -1,0 +1,399 @@
+r"""Do frames show what they were taken for? Residuals of sets that belong together, blind to noise.
+
+A frame that is late, torn or of another pattern differs from the right one by a *picture*: neighbouring pixels deviate
+alike. Noise doesn't. So every deviation here is measured as a covariance of neighbours, whose expectation is free of the
+noise, whatever the camera's; and it is compared with the light that the set moves, of which it is a share.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Integer
+
+MOST_ROW_PAIRS = 96
+"""So many pairs of rows are looked at: more make the verdict no surer."""
+BANDS = 8
+"""Parts of the picture that are judged by themselves, from top to bottom: a torn frame is wrong in some of them."""
+_LEAST_PIXELS = 200
+_LEAST_SHARE = 0.02
+"""A band with less than this share of the light isn't judged."""
+_LEAST_MODULATION = 1.5 / 255
+"""Of full scale: darker fringes drown in rounding."""
+_SURE = 2e-3
+"""What chance may add to the square of a share."""
+_HARMONICS = (2, 3)
+"""What a bent response adds to a sinusoid; it isn't the display that is late then."""
+_REPEATED = 0.25
+"""Two frames that differ by less than this share of what they should show the same."""
+
+Gray = Integer[np.ndarray, "h w"]
+Sample = Float32[np.ndarray, "pair 2 w"]
+Valid = Bool[np.ndarray, "pair 2 w"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a set of frames says of itself, for one camera."""
+
+    share: float
+    """Largest deviation of a frame, of the whole picture or a band, as a share of the light that the set moves."""
+    frame: int | None = None
+    """The frame that deviates most; None where the set doesn't tell which."""
+    repeats: bool = False
+    """Whether that frame shows what was shown before."""
+
+
+class FrameSample:
+    """The rows of a picture that are looked at."""
+
+    def __init__(self, gray: Gray, *, full_scale_gray: float) -> None:
+        height_px, width_px = gray.shape
+        count = min(height_px // 2, MOST_ROW_PAIRS)
+        first = (np.arange(count) * (height_px // 2) // max(count, 1)) * 2
+        rows = np.stack([first, first + 1], axis=1)
+        raw = gray[rows]
+        self.gray: Sample = raw.astype(np.float32)
+        self.full_scale_gray = full_scale_gray
+        self.valid: Valid = ~_widened(raw >= full_scale_gray - 1)
+
+
+def step_set(
+    frames: Sequence[FrameSample],
+    shifts_rad: Float[np.ndarray, "n"],
+    before: FrameSample | None = None,
+) -> Finding | None:
+    r"""Judge four or more phase steps by what a sinusoid leaves of each frame; None where too little light moves.
+
+    Parameters
+    ----------
+    frames
+        One per step, in the order in which they were taken.
+    shifts_rad
+        Phase shift of each, in [rad].
+    before
+        The frame that was taken before the set, to tell a repeated picture.
+
+    Notes
+    -----
+    The residual of the least-squares fit of :math:`A + B \cos(\varphi + \delta_k)` is a picture too if a display or a
+    camera bends the sinusoid. Then it is a function of the phase, the same one all over the picture:
+    :math:`\sum_h c_h B \cos h(\varphi + \delta_k)`. That part is fitted and taken off before what is left counts.
+    """
+    projector, solve = _design(shifts_rad)
+    if len(frames) < 4 or projector is None:
+        return None
+    valid = _all_valid(frames)
+    stack = np.stack([f.gray for f in frames])
+    background, in_phase, minus_quadrature = np.tensordot(solve, stack, axes=1)
+    residual = np.tensordot(projector, stack, axes=1)
+    residual -= _bent(residual, in_phase, minus_quadrature, shifts_rad, projector, valid)
+    moved = _Light.of(valid, in_phase, minus_quadrature)
+    del background
+    return _judged(residual, moved, frames, before, tell_frame=len(frames) > 4)
+
+
+def common_part(
+    frames: Sequence[FrameSample], shifts_rad: Float[np.ndarray, "n"]
+) -> "CommonPart | None":
+    """Return what all step sets and pairs of one exposure have in common: the light without the pattern."""
+    projector, solve = _design(shifts_rad)
+    if projector is None:
+        return None
+    stack = np.stack([f.gray for f in frames])
+    background, in_phase, minus_quadrature = np.tensordot(solve, stack, axes=1)
+    valid = _all_valid(frames)
+    return CommonPart(background, valid, _Light.of(valid, in_phase, minus_quadrature), frames)
+
+
+def pair_part(frames: Sequence[FrameSample]) -> "CommonPart":
+    """Return the mean of a pattern and its inverse, which is the same for all patterns of one exposure."""
+    pattern, inverse = frames
+    valid = pattern.valid & inverse.valid
+    mean = (pattern.gray + inverse.gray) / 2
+    half = (pattern.gray - inverse.gray) / 2
+    return CommonPart(mean, valid, _Light.of(valid, half), frames)
+
+
+@dataclass(frozen=True)
+class CommonPart:
+    """The part of a set that its pattern doesn't move."""
+
+    gray: Sample
+    valid: Valid
+    light: "_Light"
+    frames: Sequence[FrameSample] = field(repr=False, default=())
+
+    def against(self, other: "CommonPart", before: FrameSample | None = None) -> Finding | None:
+        """Judge this set by another one of the same exposure; None where too little light moves."""
+        valid = self.valid & other.valid
+        light = max(self.light, other.light, key=lambda part: part.energy)
+        deviation = (self.gray - other.gray)[None]
+        return _judged(deviation, light.on(valid), self.frames, before, tell_frame=False)
+
+
+def same(frames: Sequence[FrameSample]) -> Finding | None:
+    """Judge frames of one and the same pattern, the later ones by the first; None where it is too dark."""
+    valid = _all_valid(frames)
+    first = frames[0].gray
+    light = _Light.of(valid, first)
+    deviations = np.stack([f.gray - first for f in frames[1:]])
+    found = _judged(deviations, light, (), None, tell_frame=True)
+    return found and Finding(found.share, None if found.frame is None else found.frame + 1)
+
+
+# ---------------------------------------------------------------- uniform fields
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The white and the black field at one exposure: what the projector's light is, and what is there without it."""
+
+    white: FrameSample
+    black: FrameSample
+    exposure: float
+    """Exposure times gain, in any unit."""
+
+    @property
+    def lit(self) -> Valid:
+        """Pixels that tell white from black clearly."""
+        light = self.white.gray - self.black.gray
+        top = float(np.quantile(light, 0.99))
+        least = max(0.25 * top, 4 * _LEAST_MODULATION * self.white.full_scale_gray)
+        return np.asarray(light > least)
+
+    @property
+    def seen(self) -> bool:
+        """Whether the camera sees the projector at all."""
+        return int(np.count_nonzero(self.lit)) >= _LEAST_PIXELS
+
+    def darkest(self, exposure: float) -> Sample:
+        """Return what a black field may read at most at another exposure, whatever the camera's black level is."""
+        return np.asarray(self.black.gray * np.float32(max(1.0, exposure / self.exposure)))
+
+    def brightness(self, exposure: float) -> Sample:
+        """Return about how far white is above black at another exposure."""
+        above = (self.white.gray - self.black.gray) * np.float32(exposure / self.exposure)
+        room = self.white.full_scale_gray - self.darkest(exposure)
+        return np.asarray(np.minimum(above, np.maximum(room, 0)))
+
+
+def marker_light(
+    marker: FrameSample, others: Sequence[FrameSample], fields: Fields, exposure: float
+) -> float | None:
+    """Return which share of the light of its neighbours a frame has that should be black; None: nothing is bright.
+
+    Parameters
+    ----------
+    marker
+        The frame that should be black.
+    others
+        Frames of the same exposure that were taken around it.
+    fields
+        White and black as they certainly are.
+    exposure
+        Exposure times gain of marker and others.
+
+    Notes
+    -----
+    The black level of the camera needn't be known: black is allowed whatever it may read at this exposure.
+    """
+    lit, darkest = fields.lit, fields.darkest(exposure)
+    if int(np.count_nonzero(lit)) < _LEAST_PIXELS:
+        return None
+    above = [float((f.gray - darkest)[lit].mean()) for f in (marker, *others)]
+    brightest = max(above)
+    white = float(fields.brightness(exposure)[lit].mean())
+    if brightest < max(0.01 * white, _LEAST_MODULATION * marker.full_scale_gray):
+        return None
+    return max(0.0, above[0] / brightest)
+
+
+def white_light(marker: FrameSample, fields: Fields, exposure: float) -> float | None:
+    """Return which share of white a frame has that should be white; None where the camera doesn't see the projector."""
+    lit = fields.lit
+    if int(np.count_nonzero(lit)) < _LEAST_PIXELS:
+        return None
+    white = float(fields.brightness(exposure)[lit].mean())
+    dark = np.minimum(fields.darkest(exposure), fields.black.gray)
+    if white < _LEAST_MODULATION * marker.full_scale_gray:
+        return None
+    return float((marker.gray - dark)[lit].mean()) / white
+
+
+def drift(before: FrameSample, after: FrameSample, fields: Fields) -> float | None:
+    """Return how much brighter a field has become, as a share of the projector's light; None where it isn't seen."""
+    use = fields.lit & before.valid & after.valid
+    if int(np.count_nonzero(use)) < _LEAST_PIXELS:
+        return None
+    light = float((fields.white.gray - fields.black.gray)[use].mean())
+    return float((after.gray - before.gray)[use].mean()) / light
+
+
+# ---------------------------------------------------------------- covariances of neighbours
+
+
+@dataclass(frozen=True)
+class _Light:
+    """The light that a pattern moves."""
+
+    parts: tuple[Sample, ...] = field(repr=False)
+    valid: Valid = field(repr=False)
+    energies: Float[np.ndarray, "band"] = field(repr=False)
+    """Mean square without noise in [gray^2], of the whole picture and of its bands; 0 where a band isn't judged."""
+
+    @classmethod
+    def of(cls, valid: Valid, *parts: Sample) -> "_Light":
+        sums = _by_band(sum(_row_sums(part[None], valid)[0] for part in parts))
+        counts = _counts(valid)
+        energies = sums.max(axis=1) / np.maximum(counts, 1)
+        small = (sums.max(axis=1) < _LEAST_SHARE * sums[0].max()) | (counts < _LEAST_PIXELS)
+        return cls(tuple(parts), valid, np.where(small, 0.0, np.maximum(energies, 0.0)))
+
+    @property
+    def energy(self) -> float:
+        """Of the whole picture."""
+        return float(self.energies[0])
+
+    def on(self, valid: Valid) -> "_Light":
+        return _Light.of(valid & self.valid, *self.parts)
+
+
+def _judged(
+    deviations: Float32[np.ndarray, "n pair 2 w"],
+    light: _Light,
+    frames: Sequence[FrameSample],
+    before: FrameSample | None,
+    *,
+    tell_frame: bool,
+) -> Finding | None:
+    counts = _counts(light.valid)
+    full = frames[0].full_scale_gray if frames else 255.0
+    if light.energy < (_LEAST_MODULATION * full) ** 2 / 2:
+        return None
+    found = np.stack([_by_band(sums).max(axis=1) for sums in _row_sums(deviations, light.valid)])
+    found /= np.maximum(counts, 1)
+    squares = float((deviations**2 * light.valid).sum(dtype=np.float64)) / len(deviations)
+    noise = max(squares / counts[0] - float(found[:, 0].mean()), 0.0)
+    if noise / np.sqrt(counts[0]) > _SURE * light.energy:
+        return None
+    # In a band chance counts for more.
+    found[:, 1:] -= 4 * noise / np.sqrt(np.maximum(counts[1:], 1))
+    known = np.where(light.energies > 0, light.energies, np.inf)
+    shares = np.sqrt(np.maximum(found, 0.0) / known)
+    worst, band = (int(i) for i in np.unravel_index(np.argmax(shares), shares.shape))
+    share = float(shares[worst, band])
+    if tell_frame:
+        return Finding(share, worst, _repeats(worst, frames, before, light, band))
+    late = [k for k in range(len(frames)) if _repeats(k, frames, before, light, band)]
+    if late:
+        return Finding(share, late[0], repeats=True)
+    return Finding(share, _odd(frames, light, band))
+
+
+def _row_sums(
+    pictures: Float32[np.ndarray, "n pair 2 w"], valid: Valid
+) -> Float[np.ndarray, "n pair 2"]:
+    """Sum the products of neighbours in each pair of rows: across, and down."""
+    inside = pictures * valid
+    across = np.einsum("npqw,npqw->np", inside[..., :-1], inside[..., 1:])
+    # There are half as many pairs of rows as rows.
+    down = 2.0 * np.einsum("npw,npw->np", inside[:, :, 0], inside[:, :, 1])
+    return np.stack([across, down], axis=-1).astype(np.float64)
+
+
+def _by_band(sums: Float[np.ndarray, "pair k"]) -> Float[np.ndarray, "band k"]:
+    """Sum over the whole picture, then over each of its bands."""
+    return np.stack([sums.sum(axis=0), *(part.sum(axis=0) for part in _bands(sums))])
+
+
+def _counts(valid: Valid) -> Float[np.ndarray, "band"]:
+    per_pair = valid.sum(axis=(1, 2))[:, None].astype(np.float64)
+    return _by_band(per_pair)[:, 0]
+
+
+def _bands(picture: Any) -> list[Any]:
+    return np.array_split(picture, BANDS)
+
+
+def _part(picture: Any, band: int) -> Any:
+    """Return a band of a picture; 0 is all of it."""
+    return picture if band == 0 else _bands(picture)[band - 1]
+
+
+def _all_valid(frames: Sequence[FrameSample]) -> Valid:
+    return np.logical_and.reduce([f.valid for f in frames])
+
+
+def _widened(saturated: Bool[np.ndarray, "pair 2 w"]) -> Valid:
+    """Take the neighbours in: charge spills over, and lenses blur."""
+    wide = saturated.any(axis=1, keepdims=True)
+    for shift in (1, 2):
+        wide = wide.copy()
+        wide[..., shift:] |= wide[..., :-shift]
+        wide[..., :-shift] |= wide[..., shift:]
+    return np.broadcast_to(wide, saturated.shape).copy()
+
+
+def _design(shifts_rad: Float[np.ndarray, "n"]) -> tuple[Any, Any]:
+    """Return what a sinusoid leaves of n frames, and what finds it; (None, ...) if the shifts don't determine it."""
+    design = np.stack([np.ones_like(shifts_rad), np.cos(shifts_rad), np.sin(shifts_rad)], axis=1)
+    if np.linalg.matrix_rank(design) < 3:
+        return None, None
+    solve = np.linalg.pinv(design)
+    return (np.eye(len(shifts_rad)) - design @ solve).astype(np.float32), solve.astype(np.float32)
+
+
+def _bent(
+    residual: Float32[np.ndarray, "n pair 2 w"],
+    in_phase: Sample,
+    minus_quadrature: Sample,
+    shifts_rad: Float[np.ndarray, "n"],
+    projector: Float32[np.ndarray, "n n"],
+    valid: Valid,
+) -> Float32[np.ndarray, "n pair 2 w"]:
+    """Return the part of the residual that is a function of the phase, the same all over the picture."""
+    modulation = np.hypot(in_phase, minus_quadrature)
+    phase = np.arctan2(-minus_quadrature, in_phase)
+    scale = max(float(modulation[valid].max()) if valid.any() else 1.0, 1e-6)
+    shapes = []
+    for harmonic in _HARMONICS:
+        turned = harmonic * (phase[None] + shifts_rad.astype(np.float32)[:, None, None, None])
+        wave = np.tensordot(projector, modulation * np.cos(turned), axes=1)
+        if np.abs(wave[:, valid]).max(initial=0.0) > 1e-3 * scale:
+            shapes += [wave, wave * (modulation / scale)]
+    if not shapes:
+        return np.zeros_like(residual)
+    inside = np.stack([shape[:, valid].ravel() for shape in shapes], axis=1)
+    normal = inside.T @ inside
+    regular = normal + 1e-6 * np.trace(normal) * np.eye(len(shapes), dtype=normal.dtype)
+    weights = np.linalg.solve(regular, inside.T @ residual[:, valid].ravel())
+    return np.asarray(np.tensordot(weights.astype(np.float32), np.stack(shapes), axes=1))
+
+
+def _repeats(
+    index: int,
+    frames: Sequence[FrameSample],
+    before: FrameSample | None,
+    light: _Light,
+    band: int,
+) -> bool:
+    """Tell whether a frame shows the same as the one before it, where the deviation is largest."""
+    previous = frames[index - 1] if index > 0 else before
+    if previous is None or not frames or previous.gray.shape != frames[index].gray.shape:
+        return False
+    difference = _part(frames[index].gray - previous.gray, band)
+    valid = _part(light.valid, band)
+    found = _row_sums(difference[None], valid)[0].sum(axis=0).max() / max(valid.sum(), 1)
+    return bool(found < _REPEATED**2 * light.energies[band])
+
+
+def _odd(frames: Sequence[FrameSample], light: _Light, band: int) -> int | None:
+    """Return the frame that is far brighter or darker than the others, if one is."""
+    valid = _part(light.valid, band)
+    if len(frames) < 3 or not valid.any():
+        return None
+    means = np.array([float(_part(f.gray, band)[valid].mean()) for f in frames])
+    off = np.abs(means - np.median(means))
+    return int(np.argmax(off)) if off.max() > 0.5 * np.sqrt(light.energy) else None
