@@ -19,6 +19,8 @@ Size = Annotated[tuple[int, int], BeforeValidator(_size_from_text)]
 _Pixels = Annotated[int, Field(ge=16, le=16384)]
 DisplaySize = Annotated[tuple[_Pixels, _Pixels], BeforeValidator(_size_from_text)]
 """The same of a real display."""
+SerialNumber = Annotated[str, Field(coerce_numbers_to_str=True)]
+"""YAML reads one that consists of digits as a number."""
 
 
 class DeviceOptions(BaseModel):

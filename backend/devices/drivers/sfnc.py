@@ -1,0 +1,301 @@
+"""A GenICam camera's features by their standard names (SFNC), and by older names where a camera has only those.
+
+Which library reads the camera's description doesn't matter here: each brings its `Features`.
+"""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+from pydantic import Field
+
+from backend.devices.errors import FeatureError, UnsupportedFeature
+from backend.devices.options import DeviceOptions
+from backend.devices.protocols import CameraCapabilities, CameraSettings, Range, TriggerSource
+
+MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
+_COLOUR_CHANNELS = {"RGB8": 3, "BGR8": 3, "RGBa8": 4, "BGRa8": 4}
+_GREEN = 1
+"""In every colour format above."""
+_EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
+_GAINS = ("Gain", "GainAbs")
+_RAW_GAIN = "GainRaw"
+_READOUT_S = 0.004
+"""Assumed of cameras that don't tell it."""
+
+
+class SfncOptions(DeviceOptions):
+    """What every GenICam camera may be told in a rig file."""
+
+    region: tuple[int, int, int, int] | None = None
+    """Left, top, width, height in [px] of what is read of the sensor; None: what the camera is set to."""
+    exposure_us: float | None = Field(None, gt=0)
+    """Exposure in [us] of a camera that has one but no feature to set it; else refused."""
+    gain_db_per_step: float | None = Field(None, gt=0)
+    """How many dB a step of GainRaw is, where a camera has no gain in dB; None: such a gain stays as it is."""
+    colour: bool = False
+    """Whether to take the green channel of a colour camera that has no monochrome format. Its neighbours are
+    interpolated, so edges move by parts of a pixel: for demonstration only."""
+
+
+@runtime_checkable
+class Features(Protocol):
+    """A camera's features by name, as its library has them. Its errors are the library's own."""
+
+    def has(self, name: str) -> bool:
+        """Tell whether the camera has a feature now."""
+        ...
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """Return what an enumeration can be set to."""
+        ...
+
+    def text(self, name: str) -> str:
+        """Return a feature as text."""
+        ...
+
+    def number(self, name: str) -> float:
+        """Return a number."""
+        ...
+
+    def bounds(self, name: str) -> tuple[float, float, float]:
+        """Return smallest, largest and step (0: any) of a number."""
+        ...
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a number; empty if the camera doesn't say."""
+        ...
+
+    def set_text(self, name: str, value: str) -> None:
+        """Set an enumeration."""
+        ...
+
+    def set_number(self, name: str, value: float) -> None:
+        """Set a number."""
+        ...
+
+    def run(self, name: str) -> None:
+        """Execute a command."""
+        ...
+
+
+class SfncControls:
+    """One camera's exposure, gain, format and trigger, through its features.
+
+    Parameters
+    ----------
+    camera
+        Its name in the rig.
+    features
+        Its features.
+    options
+        What the rig file says.
+    buffered_frames
+        How many frames the library lets wait in free run.
+    hardware_timestamp
+        Whether frames come with a time of the camera's clock.
+    """
+
+    def __init__(
+        self,
+        camera: str,
+        features: Features,
+        options: SfncOptions,
+        *,
+        buffered_frames: int,
+        hardware_timestamp: bool,
+    ) -> None:
+        self._camera = camera
+        self._features = features
+        self._options = options
+        self._buffered_frames = buffered_frames
+        self._hardware_timestamp = hardware_timestamp
+        self._exposure = self._first(_EXPOSURES)
+        self._gain = next((n for n in _GAINS if self._is_in_db(n)), "")
+        self._raw_gain = "" if self._gain or not options.gain_db_per_step else self._first((_RAW_GAIN,))  # fmt: skip
+
+    def _first(self, names: tuple[str, ...]) -> str:
+        return next((name for name in names if self._features.has(name)), "")
+
+    def _is_in_db(self, name: str) -> bool:
+        """SFNC leaves the unit of a gain to the vendor; one that isn't told is dB by custom."""
+        return self._features.has(name) and self._features.unit(name) in ("", "dB", "DB", "db")
+
+    # ------------------------------------------------------------ before the first frame
+
+    def prepare(self) -> None:
+        """Overrule what else was set before us: automatics off, one trigger per frame, a format that we read."""
+        features = self._features
+        for name, value in (
+            ("AcquisitionMode", "Continuous"), ("ExposureMode", "Timed"), ("ExposureAuto", "Off"),
+            ("GainAuto", "Off"), ("GainSelector", "All"),
+        ):  # fmt: skip
+            self._set_if_possible(name, value)
+        formats = self._formats()
+        if features.text("PixelFormat") not in formats:
+            features.set_text("PixelFormat", formats[0])
+        self._read_region()
+        for selector in features.choices("TriggerSelector"):  # another one may hold frames back
+            features.set_text("TriggerSelector", selector)
+            self._set_if_possible("TriggerMode", "Off")
+        self._set_if_possible("TriggerSelector", "FrameStart")
+        self._set_if_possible("TriggerActivation", "RisingEdge")
+        self._set_trigger(self._sources()[0])
+
+    def _set_if_possible(self, name: str, value: str) -> None:
+        if value in self._features.choices(name) and self._features.text(name) != value:
+            self._features.set_text(name, value)
+
+    def _read_region(self) -> None:
+        region = self._options.region
+        if region is None:
+            return
+        left, top, width, height = region
+        for name, value in (
+            ("OffsetX", 0), ("OffsetY", 0), ("Width", width), ("Height", height), ("OffsetX", left), ("OffsetY", top),
+        ):  # fmt: skip
+            if not self._features.has(name):
+                if value:
+                    raise UnsupportedFeature(self._camera, f"has no {name}; leave the region out")
+                continue
+            low, high, step = self._features.bounds(name)
+            allowed = Range(low, high, step, "px")
+            if value not in allowed or allowed.nearest(value) != value:
+                raise FeatureError(
+                    self._camera,
+                    f"{name} {value} of region {list(region)} is not within {allowed} in steps of {step:g}; choose another",
+                )
+            self._features.set_number(name, value)
+
+    # ------------------------------------------------------------ what it can
+
+    def capabilities(self) -> CameraCapabilities:
+        """Return what the camera can be set to, as it is prepared."""
+        width_px, height_px = (round(self._features.number(n)) for n in ("Width", "Height"))
+        return CameraCapabilities(
+            sensor_size=(width_px, height_px),
+            pixel_formats=self._formats(),
+            exposure_us=self._exposure_range(),
+            gain_db=self._gain_range(),
+            trigger_sources=self._sources(),
+            hardware_timestamp=self._hardware_timestamp,
+            min_frame_period_s=self._readout_s(),
+            buffered_frames=self._buffered_frames,
+        )
+
+    def _formats(self) -> tuple[str, ...]:
+        there = self._features.choices("PixelFormat")
+        formats = tuple(name for name in there if name in MONO_BITS)
+        if not formats and self._options.colour:
+            formats = tuple(name for name in there if name in _COLOUR_CHANNELS)
+        if not formats:
+            known = ", ".join(MONO_BITS)
+            raise UnsupportedFeature(
+                self._camera,
+                f"its pixel formats ({', '.join(there)}) are none of {known}; use a monochrome camera, or `colour: true` for demonstration",
+            )
+        return formats
+
+    def _exposure_range(self) -> Range:
+        if self._exposure:
+            return Range(*self._features.bounds(self._exposure), "us")
+        fixed_us = self._options.exposure_us
+        if fixed_us is None:
+            raise UnsupportedFeature(
+                self._camera,
+                "has no exposure that could be set; say in the rig file which it has, e.g. `exposure_us: 20000`",
+            )
+        return Range(fixed_us, fixed_us, 0.0, "us")
+
+    def _gain_range(self) -> Range:
+        if self._gain:
+            return Range(*self._features.bounds(self._gain), "dB")
+        if self._raw_gain:
+            low, high, step = self._features.bounds(self._raw_gain)
+            per_step = self._db_per_step()
+            return Range(0.0, (high - low) * per_step, step * per_step, "dB")
+        return Range(0.0, 0.0, 0.0, "dB")
+
+    def _db_per_step(self) -> float:
+        return self._options.gain_db_per_step or 0.0
+
+    def _sources(self) -> tuple[TriggerSource, ...]:
+        modes = self._features.choices("TriggerMode")
+        there = set(self._features.choices("TriggerSource")) if "On" in modes else set()
+        wired = [s for s in TriggerSource if s.value in there and s is not TriggerSource.FREE_RUN]
+        return (*wired, TriggerSource.FREE_RUN)
+
+    def _readout_s(self) -> float:
+        known = self._features.has("SensorReadoutTime")
+        return self._features.number("SensorReadoutTime") * 1e-6 if known else _READOUT_S
+
+    # ------------------------------------------------------------ settings
+
+    def read(self) -> CameraSettings:
+        """Return the settings in force."""
+        features, exposure_us = self._features, self._options.exposure_us or 0.0
+        return CameraSettings(
+            exposure_us=features.number(self._exposure) if self._exposure else exposure_us,
+            gain_db=self._read_gain(),
+            pixel_format=features.text("PixelFormat"),
+            trigger=self._read_trigger(),
+        )
+
+    def _read_gain(self) -> float:
+        if self._raw_gain:
+            low, _, _ = self._features.bounds(self._raw_gain)
+            return (self._features.number(self._raw_gain) - low) * self._db_per_step()
+        return self._features.number(self._gain) if self._gain else 0.0
+
+    def _read_trigger(self) -> TriggerSource:
+        features = self._features
+        if "On" not in features.choices("TriggerMode") or features.text("TriggerMode") != "On":
+            return TriggerSource.FREE_RUN
+        return TriggerSource(features.text("TriggerSource"))
+
+    def apply(self, wanted: CameraSettings, now: CameraSettings) -> CameraSettings:
+        """Set what differs and return what holds then."""
+        if wanted.pixel_format not in (None, now.pixel_format):
+            self._features.set_text("PixelFormat", str(wanted.pixel_format))
+        if wanted.trigger is not now.trigger:
+            self._set_trigger(wanted.trigger)
+        if wanted.exposure_us != now.exposure_us:
+            self._features.set_number(self._exposure, wanted.exposure_us)
+        if wanted.gain_db != now.gain_db:
+            self._set_gain(wanted.gain_db)
+        return self.read()
+
+    def _set_gain(self, gain_db: float) -> None:
+        if not self._raw_gain:
+            self._features.set_number(self._gain, gain_db)
+            return
+        low, high, step = self._features.bounds(self._raw_gain)
+        raw = Range(low, high, step).nearest(low + gain_db / self._db_per_step())
+        self._features.set_number(self._raw_gain, raw)
+
+    def _set_trigger(self, trigger: TriggerSource) -> None:
+        if trigger is TriggerSource.FREE_RUN:
+            self._set_if_possible("TriggerMode", "Off")
+            return
+        self._features.set_text("TriggerMode", "On")
+        self._features.set_text("TriggerSource", trigger.value)
+
+
+def bits_of(pixel_format: str) -> int:
+    """Return the significant bits of a format that `SfncControls` offers."""
+    return MONO_BITS.get(pixel_format, 8)
+
+
+def gray_of(
+    data: UInt8[np.ndarray, "..."] | UInt16[np.ndarray, "..."],
+    width_px: int,
+    height_px: int,
+    pixel_format: str,
+) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"] | None:
+    """Copy a picture out of a buffer's samples: monochrome as it is, of colours the green; None if it holds fewer."""
+    channels = _COLOUR_CHANNELS.get(pixel_format, 1)
+    flat = data.reshape(-1)
+    if flat.size < width_px * height_px * channels:
+        return None
+    picture = flat[: width_px * height_px * channels].reshape(height_px, width_px, channels)
+    return picture[:, :, _GREEN if channels > 1 else 0].copy()
