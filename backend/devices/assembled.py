@@ -3,8 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from backend.devices.errors import RigConfigError
 from backend.devices.opening import open_all
-from backend.devices.protocols import Camera, DeviceInfo, Projector
+from backend.devices.protocols import (
+    Camera,
+    DeviceInfo,
+    Projector,
+    SequenceProjector,
+    TriggerSource,
+)
 from backend.domain.rig import CameraFacts, ProjectorFacts, RigCalibration, RigFacts
 
 
@@ -18,6 +25,14 @@ class SensorFacts:
     full_well_e: float = 10_000.0
     """Electrons at full scale, at gain 0 dB."""
     read_noise_e: float = 10.0
+
+
+@dataclass(frozen=True)
+class CameraLimits:
+    """What a camera shall not be used beyond, though it could; None: as far as it goes."""
+
+    longest_exposure_ms: float | None = None
+    largest_gain_db: float | None = None
 
 
 class AssembledRig:
@@ -35,6 +50,12 @@ class AssembledRig:
         What is known of each camera's sensor; sizes and ranges are read from the devices.
     calibration
         Where the devices are, if that is known.
+    trigger_lines
+        The line of each camera that the projector's trigger output drives.
+    limits
+        What each camera shall not be used beyond.
+    snap_exposures
+        Whether exposures are to be whole frame periods of the projector.
     """
 
     def __init__(
@@ -46,6 +67,9 @@ class AssembledRig:
         sensors: Mapping[str, SensorFacts],
         gamma: float = 1.0,
         calibration: RigCalibration | None = None,
+        trigger_lines: Mapping[str, TriggerSource] | None = None,
+        limits: Mapping[str, CameraLimits] | None = None,
+        snap_exposures: bool = True,
     ) -> None:
         self._name = name
         self._cameras = dict(cameras)
@@ -53,6 +77,9 @@ class AssembledRig:
         self._sensors = dict(sensors)
         self._gamma = gamma
         self._calibration = calibration
+        self._trigger_lines = dict(trigger_lines or {})
+        self._limits = dict(limits or {})
+        self._snap_exposures = snap_exposures
 
     @property
     def name(self) -> str:
@@ -75,6 +102,17 @@ class AssembledRig:
         """The projector or screen."""
         return self._projector
 
+    @property
+    def trigger_lines(self) -> Mapping[str, TriggerSource]:
+        """The wired cameras, and which line of each is."""
+        return self._trigger_lines
+
+    @property
+    def is_hardware_timed(self) -> bool:
+        """Whether bursts run by the projector's clock: every camera is wired, and the projector runs sequences."""
+        wired = set(self._cameras) <= set(self._trigger_lines)
+        return wired and isinstance(self._projector, SequenceProjector)
+
     def open(self) -> None:
         """Open every device; when one refuses, the others are closed again."""
         open_all((self._projector, *self._cameras.values()))
@@ -95,7 +133,9 @@ class AssembledRig:
         """Return sizes and ranges as the devices tell them, noise as the rig's owner measured it."""
         cameras = {name: self._camera_facts(name) for name in self._cameras}
         can = self._projector.capabilities
-        period_ms = 1000.0 / can.refresh_hz if can.refresh_hz else None
+        # A pattern of a sequence is complete within the exposure, whatever that is: no grid is needed.
+        on_grid = self._snap_exposures and can.refresh_hz and not self.is_hardware_timed
+        period_ms = 1000.0 / can.refresh_hz if on_grid and can.refresh_hz else None
         gamma = 1.0 if can.linear else self._gamma
         return RigFacts(cameras, next(iter(cameras)), ProjectorFacts(*can.size, period_ms, gamma))
 
@@ -106,14 +146,31 @@ class AssembledRig:
     def _camera_facts(self, name: str) -> CameraFacts:
         can, sensor = self._cameras[name].capabilities, self._sensors[name]
         width_px, height_px = can.sensor_size
+        shortest_us, longest_us = self._exposures_us(name)
+        gain_db = self._limits.get(name, CameraLimits()).largest_gain_db
         return CameraFacts(
             width_px=width_px,
             height_px=height_px,
             bit_depth=sensor.bit_depth,
-            exposure_min_ms=can.exposure_us.min / 1000.0,
-            exposure_max_ms=can.exposure_us.max / 1000.0,
+            exposure_min_ms=shortest_us / 1000.0,
+            exposure_max_ms=longest_us / 1000.0,
             black_level_gray=sensor.black_level_gray,
             full_well_e=sensor.full_well_e,
             read_noise_e=sensor.read_noise_e,
-            gain_max_db=can.gain_db.max,
+            gain_max_db=can.gain_db.max if gain_db is None else min(gain_db, can.gain_db.max),
         )
+
+    def _exposures_us(self, name: str) -> tuple[float, float]:
+        """Return the shortest and the longest exposure that device, wiring and owner allow."""
+        can, limit_ms = self._cameras[name].capabilities.exposure_us, None
+        if name in self._limits:
+            limit_ms = self._limits[name].longest_exposure_ms
+        least_us = self._projector.capabilities.min_exposure_us if self.is_hardware_timed else 0.0
+        longest_us = can.max if limit_ms is None else min(can.max, 1000.0 * limit_ms)
+        shortest_us = max(can.min, least_us)
+        if shortest_us > longest_us:
+            raise RigConfigError(
+                f"{name}: exposures have to be at least {shortest_us / 1000:g} ms, but the rig file allows"
+                f" {longest_us / 1000:g} ms; raise its limit"
+            )
+        return shortest_us, longest_us

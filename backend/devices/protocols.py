@@ -154,6 +154,8 @@ class ProjectorCapabilities:
     pixel_layout: str = "square"
     """`square`, or `diamond` for DLP chips with rotated mirrors."""
     trigger_out: bool = False
+    min_exposure_us: float = 0.0
+    """How long a pattern of a hardware-timed sequence has to be shown at least."""
     certain: bool = False
     """Whether a pattern is lit by construction when `show` returns. False: electronics that nobody has looked into
     stand between, and every scan verifies by its frames that the light followed."""
@@ -385,6 +387,26 @@ class Wired(Protocol):
     @property
     def trigger_lines(self) -> Mapping[str, TriggerSource]:
         """The line of each wired camera that the projector's trigger output drives; the others are left out."""
+        ...
+
+
+@runtime_checkable
+class Settles(Protocol):
+    """A projector whose light comes some time after it says so; the latency calibration found how long."""
+
+    settle_ms: float | None
+    """What it waits by itself; None: not measured."""
+    settle_exposure_ms: float | None
+    """The exposure that this was measured with; shorter ones see more of the change. None: not known."""
+
+
+@runtime_checkable
+class Remarks(Protocol):
+    """A device that has something to say to its owner, found out when it was opened."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Return what is doubtful about it, a sentence each; empty: nothing."""
         ...
 
 

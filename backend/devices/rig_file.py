@@ -5,9 +5,11 @@
     cameras:
       left:  {driver: aravis, address: 192.168.10.2, sensor: {full_well_e: 10500, read_noise_e: 6.5}}
       right: {driver: aravis, address: 192.168.10.3, sensor: {full_well_e: 10500, read_noise_e: 6.5}}
-    projector: {driver: page, size: 1280x800, refresh_hz: 60, settle_ms: 17}
+    projector: {driver: page, size: 1280x800}
+    snap_exposures: true
 
-The first camera is the reference. What a driver needs besides (`address` above) is its own matter.
+The first camera is the reference. `trigger_line: Line1` says which line of a camera the projector's trigger output
+drives; `limits: {longest_exposure_ms: 500, largest_gain_db: 12}` what a camera shall not be used beyond. What a driver needs besides (`address` above) is its own matter.
 """
 
 import re
@@ -19,16 +21,18 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from backend.devices.assembled import AssembledRig, SensorFacts
+from backend.devices.assembled import AssembledRig, CameraLimits, SensorFacts
 from backend.devices.driver_loading import make_camera, make_projector
 from backend.devices.errors import RigConfigError
 from backend.devices.pages import PageDesk
+from backend.devices.protocols import TriggerSource
 from backend.domain.rig import PinholeModel, Pose, RigCalibration
 from backend.numerics.pinhole import DISTORTION_SIZES
 
 _Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
+_LINES = [s.value for s in TriggerSource if s.value.startswith("Line")]
 _CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,40}")
 
 
@@ -45,6 +49,13 @@ class SensorEntry(_Part):
     read_noise_e: float = Field(10.0, ge=0)
 
 
+class LimitsEntry(_Part):
+    """What a camera shall not be used beyond, though it could."""
+
+    longest_exposure_ms: float | None = Field(None, gt=0)
+    largest_gain_db: float | None = Field(None, ge=0)
+
+
 class CameraEntry(BaseModel):
     """One camera; keys that aren't named here go to its driver."""
 
@@ -52,6 +63,16 @@ class CameraEntry(BaseModel):
 
     driver: str
     sensor: SensorEntry = SensorEntry()
+    trigger_line: TriggerSource | None = None
+    """The line that the projector's trigger output drives; None: not wired."""
+    limits: LimitsEntry = LimitsEntry()
+
+    @field_validator("trigger_line")
+    @classmethod
+    def _is_a_line(cls, value: TriggerSource | None) -> TriggerSource | None:
+        if value in (TriggerSource.SOFTWARE, TriggerSource.FREE_RUN):
+            raise ValueError(f"{value} is no line: give one of {', '.join(_LINES)}")
+        return value
 
 
 class ProjectorEntry(BaseModel):
@@ -115,6 +136,8 @@ class RigFile(_Part):
     title: str = ""
     cameras: dict[str, CameraEntry] = Field(min_length=1)
     projector: ProjectorEntry
+    snap_exposures: bool = True
+    """Exposures are whole frame periods of the projector, so that its modulation averages out."""
     calibration: CalibrationEntry | None = None
 
     @classmethod
@@ -198,6 +221,9 @@ def assemble(name: str, file: RigFile, desk: PageDesk) -> AssembledRig:
         },
         gamma=file.projector.gamma,
         calibration=_calibration(file),
+        trigger_lines={c: e.trigger_line for c, e in file.cameras.items() if e.trigger_line},
+        limits={c: CameraLimits(**e.limits.model_dump()) for c, e in file.cameras.items()},
+        snap_exposures=file.snap_exposures,
     )
 
 

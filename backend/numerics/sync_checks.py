@@ -49,7 +49,7 @@ class FrameSample:
     """The rows of a picture that are looked at."""
 
     def __init__(self, gray: Gray, *, full_scale_gray: float) -> None:
-        height_px, width_px = gray.shape
+        height_px = gray.shape[0]
         count = min(height_px // 2, MOST_ROW_PAIRS)
         first = (np.arange(count) * (height_px // 2) // max(count, 1)) * 2
         rows = np.stack([first, first + 1], axis=1)
@@ -328,12 +328,11 @@ def _all_valid(frames: Sequence[FrameSample]) -> Valid:
 
 def _widened(saturated: Bool[np.ndarray, "pair 2 w"]) -> Valid:
     """Take the neighbours in: charge spills over, and lenses blur."""
-    wide = saturated.any(axis=1, keepdims=True)
+    wide: Any = saturated.any(axis=1, keepdims=True)
     for shift in (1, 2):
-        wide = wide.copy()
-        wide[..., shift:] |= wide[..., :-shift]
-        wide[..., :-shift] |= wide[..., shift:]
-    return np.broadcast_to(wide, saturated.shape).copy()
+        wide[..., shift:] |= wide[..., :-shift].copy()
+        wide[..., :-shift] |= wide[..., shift:].copy()
+    return np.array(np.broadcast_to(wide, saturated.shape))
 
 
 def _design(shifts_rad: Float[np.ndarray, "n"]) -> tuple[Any, Any]:
