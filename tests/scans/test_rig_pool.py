@@ -1,15 +1,20 @@
 """Rigs: opened when needed, one thread each, lent to one at a time, opened anew after a loss."""
 
 import threading
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
 from backend.contract.events import Event, RigChanged
-from backend.devices.errors import DeviceDisconnected
+from backend.contract.rigs import RigLink
+from backend.devices.errors import DeviceDisconnected, DeviceTimeout
 from backend.devices.protocols import LinkState, Rig
 from backend.domain.errors import RigBusyError, RigFailedError
-from backend.jobs.rigs import LivePicture, Owner, RigPool
-from tests.scans.toy import ToyRig, ToyRigs
+from backend.jobs import rigs
+from backend.jobs.live import LivePicture, LiveWish
+from backend.jobs.rigs import Owner, RigPool
+from tests.scans.toy import ToyRigs
 
 ADA = Owner("1", "bracket", "ada")
 BOB = Owner("2", "cover", "bob")
@@ -141,56 +146,170 @@ def test_closing_gives_every_rig_back(place: Place) -> None:
 
 # live pictures
 
+WISH = LiveWish(exposure_ms=10.0)
 
-def newest(place: Place) -> LivePicture | None:
-    """Ask twice: the first question asks for a picture that the second one finds."""
-    place.pool.live("toy", "left")
-    place.pool.use("toy", {}, lambda rig: None)  # waits until the rig's thread has taken it
+
+def settled(place: Place) -> None:
+    """Wait until the rig's thread has done what it was asked for."""
+    place.pool.use("toy", {}, lambda rig: None)
+
+
+def newest(place: Place, wish: LiveWish = WISH) -> LivePicture | None:
+    place.pool.wish("toy", wish)
+    place.pool.watch("toy")
+    settled(place)
     return place.pool.live("toy", "left")
 
 
-def test_an_idle_rig_takes_a_picture_under_white_light_on_request(place: Place) -> None:
+def test_looking_asks_for_nothing(place: Place) -> None:
     assert place.pool.live("toy", "left") is None, "nobody has opened it"
     place.pool.given("toy", {})
+    place.pool.wish("toy", WISH)
     assert place.pool.live("toy", "left") is None
-    picture = newest(place)
-    assert picture is not None
-    assert picture.gray.max() > 20
+    settled(place)
+    assert place.pool.live("toy", "left") is None
+    assert all(camera.frames == 0 for camera in place.rigs.opened[0].cameras.values())
+
+
+def test_a_watched_rig_takes_pictures_as_wished_and_stays_armed(place: Place) -> None:
+    place.pool.given("toy", {})
+    first, second = newest(place), newest(place)
+    assert first is not None
+    assert second is not None
+    assert second.number > first.number
+    assert first.exposure_ms == pytest.approx(10.0)
+    assert first.gray.max() > 200, "white"
     rig = place.rigs.opened[0]
-    assert rig.projector.picture.max() == 0, "dark again"
+    assert {camera.state for camera in rig.cameras.values()} == {LinkState.ARMED}
+    assert rig.configured == 2, "once for each camera"
+    gray = newest(place, LiveWish(exposure_ms=5.0, pattern="gray", level=100))
+    assert gray is not None
+    assert gray.gray.max() == pytest.approx(50, abs=1)
+
+
+def test_rest_disarms_and_darkens(place: Place) -> None:
+    place.pool.given("toy", {})
+    newest(place)
+    place.pool.rest("toy")
+    settled(place)
+    rig = place.rigs.opened[0]
+    assert {camera.state for camera in rig.cameras.values()} == {LinkState.READY}
+    assert rig.projector.picture.max() == 0
+    assert not place.pool.status("toy").is_live
+
+
+def test_pictures_end_by_themselves_when_nobody_looks(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rigs, "LIVE_HOLD_S", 0.05)
+    place.pool.given("toy", {})
+    newest(place)
+    rig = place.rigs.opened[0]
+    asleep = threading.Event()
+    for _ in range(200):
+        if all(camera.state is LinkState.READY for camera in rig.cameras.values()):
+            break
+        asleep.wait(0.05)
     assert {camera.state for camera in rig.cameras.values()} == {LinkState.READY}
 
 
-def test_a_lent_rig_isnt_disturbed(place: Place) -> None:
+def test_a_capture_finds_cameras_at_rest_and_isnt_disturbed(place: Place) -> None:
+    place.pool.given("toy", {})
+    newest(place)
     with place.pool.lease("toy", {}, ADA) as lease:
+        states = lease.call(lambda rig: {camera.state for camera in rig.cameras.values()})
+        assert states == {LinkState.READY}
+        frames = place.rigs.opened[0].cameras["left"].frames
         shown = LivePicture(place.rigs.opened[0].projector.picture, 8)
         place.pool.show("toy", "left", shown)
+        place.pool.watch("toy")
         assert place.pool.live("toy", "left") is shown
         lease.call(lambda rig: None)
-        assert place.rigs.shots == 0
+        assert place.rigs.opened[0].cameras["left"].frames == frames
+    later = newest(place)
+    assert later is not shown
 
 
 def test_many_questions_are_one_picture(place: Place) -> None:
     place.pool.given("toy", {})
-    blocked, go_on = threading.Event(), threading.Event()
-
-    def before(shot: int) -> None:
-        blocked.set()
-        assert go_on.wait(10)
-
-    place.rigs.faults.before_shot = before
-    place.pool.live("toy", "left")
-    assert blocked.wait(10)
+    place.pool.wish("toy", WISH)
+    place.rigs.faults.hold = threading.Event()
     for _ in range(20):
+        place.pool.watch("toy")
         assert place.pool.live("toy", "left") is None, "never waits"
-    go_on.set()
-    place.pool.use("toy", {}, lambda rig: None)
-    assert place.rigs.shots == 1
+    place.rigs.faults.hold.set()
+    settled(place)
+    assert place.rigs.opened[0].cameras["left"].frames == 1
 
 
-def test_a_failing_idle_picture_is_no_error(place: Place) -> None:
+def test_a_picture_that_fails_is_a_sentence_and_the_next_one_is_tried(place: Place) -> None:
     place.pool.given("toy", {})
-    place.rigs.faults.errors = {1: [DeviceDisconnected("left", "gone")]}
-    assert newest(place) is None or place.rigs.shots > 1
-    rig: ToyRig = place.rigs.opened[0]
-    assert rig.closed == 0
+    place.rigs.faults.errors = {0: [DeviceTimeout("left", "no frame came")]}
+    assert newest(place) is None
+    assert place.pool.status("toy").failure == "left: no frame came"
+    assert newest(place) is not None
+    assert place.pool.status("toy").failure is None
+
+
+# without a scan
+
+
+def test_connecting_and_disconnecting(place: Place) -> None:
+    assert place.pool.status("toy").link is RigLink.CLOSED
+    place.pool.connect("toy", {"seed": 3})
+    settled_with(place, {"seed": 3})
+    status = place.pool.status("toy")
+    assert (status.link, status.options) == (RigLink.OPEN, {"seed": 3})
+    assert [known.info.model for known in status.devices] == ["camera", "camera", "projector"]
+    place.pool.connect("toy", {})
+    assert len(place.rigs.opened) == 1, "an open one stays as it is"
+    place.pool.disconnect("toy")
+    until(lambda: place.pool.status("toy").link is RigLink.CLOSED)
+    assert place.rigs.opened[0].closed == 1
+    place.pool.watch("toy")
+    place.pool.reconnect("toy")
+    until(lambda: place.pool.status("toy").link is RigLink.OPEN)
+    assert [rig.options for rig in place.rigs.opened] == [{"seed": 3}, {"seed": 3}]
+
+
+def test_a_rig_that_cant_be_connected_says_why(place: Place) -> None:
+    place.pool.connect("toy", {"broken": True})
+    until(lambda: place.pool.status("toy").failure is not None)
+    status = place.pool.status("toy")
+    assert (status.link, status.failure) == (
+        RigLink.CLOSED,
+        "Rig 'toy' doesn't answer: switch it on.",
+    )
+
+
+def test_a_lent_rig_isnt_disconnected(place: Place) -> None:
+    with place.pool.lease("toy", {}, ADA):
+        for refused in (place.pool.disconnect, place.pool.reconnect):
+            with pytest.raises(RigBusyError, match="ada captures scan 'bracket'"):
+                refused("toy")
+    assert place.rigs.opened[0].closed == 0
+
+
+def test_disconnecting_ends_a_picture_that_doesnt_come(place: Place) -> None:
+    place.pool.given("toy", {})
+    place.pool.wish("toy", WISH)
+    place.rigs.faults.hold = threading.Event()
+    place.pool.watch("toy")
+    until(lambda: place.rigs.opened[0].cameras["left"].frames == 1)
+    place.pool.disconnect("toy")
+    until(lambda: place.pool.status("toy").link is RigLink.CLOSED)
+    assert place.rigs.opened[0].closed == 1
+
+
+def settled_with(place: Place, options: dict[str, Any]) -> None:
+    place.pool.use("toy", options, lambda rig: None)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for what happens on another thread."""
+    pause = threading.Event()
+    for _ in range(1000):
+        if condition():
+            return
+        pause.wait(0.01)
+    raise AssertionError("it didn't happen within 10 s")
