@@ -7,13 +7,13 @@ is imported until a rig with its driver is opened, so one that is broken doesn't
 
 import importlib
 from collections.abc import Callable, Mapping
-from importlib.metadata import EntryPoint, entry_points
+from dataclasses import dataclass
 from typing import Any
 
 from backend.devices.errors import RigConfigError
 from backend.devices.pages import PageDesk
+from backend.devices.plug_ins import call_plug_in, lacking, load_plug_in, package_of, plug_ins
 from backend.devices.protocols import Camera, Projector
-from backend.domain.errors import UnglareError
 
 CAMERAS = "unglare.cameras"
 PROJECTORS = "unglare.projectors"
@@ -23,6 +23,22 @@ _BUILT_IN = {
     CAMERAS: {"aravis": f"{_DRIVERS}.aravis_camera:create_camera"},
     PROJECTORS: {"page": f"{_DRIVERS}.page_projector:create_projector"},
 }
+
+_DEVICE = ("name", "info", "state", "open", "close", "reconnect", "capabilities")
+_REQUIRED = {
+    CAMERAS: (*_DEVICE, "settings", "configure", "arm", "trigger", "get_frame", "disarm", "abort"),
+    PROJECTORS: (*_DEVICE, "load", "show", "blank"),
+}
+_PROTOCOLS = {CAMERAS: "Camera", PROJECTORS: "Projector"}
+
+
+@dataclass(frozen=True)
+class DriverEntry:
+    """A driver that rig files can name."""
+
+    name: str
+    package: str
+    """Distribution that it comes from, with version."""
 
 
 def make_camera(name: str, driver: str, options: Mapping[str, Any]) -> Camera:
@@ -52,7 +68,18 @@ def make_projector(name: str, driver: str, options: Mapping[str, Any], desk: Pag
 
 def available_drivers(group: str) -> tuple[str, ...]:
     """Return the drivers of `CAMERAS` or `PROJECTORS` that have a name; nothing is imported."""
-    return (*_BUILT_IN[group], *sorted(_entries(group).keys() - _BUILT_IN[group].keys()))
+    return tuple(entry.name for entry in driver_entries(group))
+
+
+def driver_entries(group: str) -> tuple[DriverEntry, ...]:
+    """Return the drivers of `CAMERAS` or `PROJECTORS`, ours first; nothing is imported."""
+    ours = (DriverEntry(name, "unglare") for name in _BUILT_IN[group])
+    others = (
+        DriverEntry(name, package_of(entry))
+        for name, entry in plug_ins(group).items()
+        if name not in _BUILT_IN[group]
+    )
+    return (*ours, *others)
 
 
 def load_factory(group: str, name: str, driver: str) -> Callable[..., Any]:
@@ -67,36 +94,41 @@ def load_factory(group: str, name: str, driver: str) -> Callable[..., Any]:
     RigConfigError
         If there is no such driver or it can't be loaded.
     """
-    entry = _entries(group).get(driver)
-    place = _BUILT_IN[group].get(driver)
-    try:
-        if place is not None:
-            module, _, attribute = place.partition(":")
-            built_in: Callable[..., Any] = getattr(importlib.import_module(module), attribute)
-            return built_in
-        if entry is not None:
-            from_package: Callable[..., Any] = entry.load()
-            return from_package
-    except Exception as error:
+    factory = _imported(group, name, driver)
+    if not callable(factory):
         raise RigConfigError(
-            f"{name}: driver {driver} can't be loaded ({type(error).__name__}: {error}); check that its package is installed"
-        ) from error
+            f"{name}: driver {driver} is a {type(factory).__name__}, not a function that makes a device; check its"
+            " package"
+        )
+    made: Callable[..., Any] = factory
+    return made
+
+
+def _imported(group: str, name: str, driver: str) -> Any:
+    entry, place = plug_ins(group).get(driver), _BUILT_IN[group].get(driver)
+    if place is not None:
+        module, _, attribute = place.partition(":")
+        return getattr(importlib.import_module(module), attribute)
+    if entry is not None:
+        try:
+            return load_plug_in(entry)
+        except RigConfigError as error:
+            raise RigConfigError(f"{name}: {error.sentence}") from error
     known = ", ".join(available_drivers(group))
     raise RigConfigError(f"{name}: there is no driver {driver!r}; choose {known}")
 
 
 def _made(group: str, name: str, driver: str, options: Mapping[str, Any], **more: object) -> Any:
     factory = load_factory(group, name, driver)
-    try:
-        return factory(name, dict(options), **more)
-    except UnglareError:
-        raise
-    except Exception as error:
-        # A third party's factory may raise anything; the cause keeps its traceback.
+    made = call_plug_in(
+        f"{name}: driver {driver}",
+        lambda: factory(name, dict(options), **more),
+        "check its options",
+    )
+    missing = lacking(made, _REQUIRED[group])
+    if missing:
         raise RigConfigError(
-            f"{name}: driver {driver} failed with {type(error).__name__}: {error}; check its options"
-        ) from error
-
-
-def _entries(group: str) -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=group)}
+            f"{name}: driver {driver} made a {type(made).__name__} without {missing}; see"
+            f" backend.devices.protocols.{_PROTOCOLS[group]}"
+        )
+    return made

@@ -9,12 +9,11 @@ import importlib
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from backend.devices.errors import RigConfigError, RigNotFoundError
+from backend.devices.plug_ins import call_plug_in, lacking, load_plug_in, package_of, plug_ins
 from backend.devices.protocols import Rig
-from backend.domain.errors import UnglareError
 
 GROUP = "unglare.rigs"
 DEFAULT_METHOD = "hdr-fringe"
@@ -41,7 +40,11 @@ class RigEntry:
 def available_rigs() -> tuple[RigEntry, ...]:
     """Return the rigs that have a name, the built-in one first; nothing is imported."""
     built_in = (RigEntry(name, "unglare") for name in _BUILT_IN)
-    return (*built_in, *(RigEntry(e.name, _package(e)) for e in _entries().values()))
+    entries = plug_ins(GROUP).values()
+    return (
+        *built_in,
+        *(RigEntry(e.name, package_of(e)) for e in entries if e.name not in _BUILT_IN),
+    )
 
 
 def open_rig(name: str, options: Mapping[str, object] | None = None) -> Rig:
@@ -62,19 +65,11 @@ def open_rig(name: str, options: Mapping[str, object] | None = None) -> Rig:
         If the factory refuses the options or doesn't return a rig.
     """
     factory = _factory(name)
-    try:
-        rig = factory(dict(options or {}))
-    except UnglareError:
-        raise
-    except Exception as error:
-        # A third party's factory may raise anything; the cause keeps its traceback.
-        raise RigConfigError(
-            f"rig {name}: its factory failed with {type(error).__name__}: {error}; check its options"
-        ) from error
-    missing = [attribute for attribute in _REQUIRED if not hasattr(rig, attribute)]
+    rig = call_plug_in(f"rig {name}: its factory", lambda: factory(dict(options or {})))
+    missing = lacking(rig, _REQUIRED)
     if missing:
         raise RigConfigError(
-            f"rig {name}: its factory returned a {type(rig).__name__} without {', '.join(missing)};"
+            f"rig {name}: its factory returned a {type(rig).__name__} without {missing};"
             " see backend.devices.protocols.Rig"
         )
     opened: Rig = rig
@@ -92,9 +87,25 @@ def options_schema(name: str) -> dict[str, Any]:
     ------
     RigNotFoundError
         If there is no such rig, module or factory.
+    RigConfigError
+        If the factory describes its options by what is no pydantic model.
     """
-    model = getattr(_factory(name), "options_model", None)
-    return model.model_json_schema() if model else {}
+    return schema_of(f"rig {name}: its factory's options_model", _factory(name))
+
+
+def schema_of(what: str, factory: object) -> dict[str, Any]:
+    """Return the JSON schema of the options that a factory of a rig or driver takes, empty where it doesn't say.
+
+    Raises
+    ------
+    RigConfigError
+        If its `options_model` is no pydantic model.
+    """
+    model = getattr(factory, "options_model", None)
+    if model is None:
+        return {}
+    schema = call_plug_in(what, lambda: model.model_json_schema(), "it has to be a pydantic model")
+    return dict(schema)
 
 
 def rig_for(scene: str | None, method: str) -> str:
@@ -122,42 +133,39 @@ def method_for(rig: str) -> str:
     >>> method_for("simulated"), method_for("sim-lcd")
     ('hdr-fringe', 'fringe-reflection')
     """
-    methods = options_schema(rig).get("methods") if rig in _BUILT_IN or rig in _entries() else None
+    methods = (
+        options_schema(rig).get("methods") if rig in _BUILT_IN or rig in plug_ins(GROUP) else None
+    )
     return str(methods[0]) if methods else DEFAULT_METHOD
 
 
 def _factory(name: str) -> Callable[[Mapping[str, object]], Any]:
-    entry = None if name in _BUILT_IN else _entries().get(name)
+    entry = None if name in _BUILT_IN else plug_ins(GROUP).get(name)
     if entry is not None:
-        return _loaded(name, entry.load)
+        return _callable(name, load_plug_in(entry))
     place = _BUILT_IN.get(name, name)
     if ":" in place:
         module, _, attribute = place.partition(":")
-        return _loaded(name, lambda: getattr(importlib.import_module(module), attribute))
+        return _callable(name, _imported(name, module, attribute))
     names = ", ".join(rig.name for rig in available_rigs())
     raise RigNotFoundError(
         f"there is no rig {name!r}; choose {names}, or give package.module:factory"
     )
 
 
-def _loaded(name: str, load: Callable[[], Any]) -> Callable[[Mapping[str, object]], Any]:
+def _imported(name: str, module: str, attribute: str) -> object:
     try:
-        factory = load()
-    except Exception as error:
+        return getattr(importlib.import_module(module), attribute)
+    except (Exception, SystemExit) as error:
         # Importing a third party's module may fail in any way; the cause keeps its traceback.
         raise RigNotFoundError(
             f"rig {name} can't be loaded ({type(error).__name__}: {error}); check that its package is installed"
         ) from error
+
+
+def _callable(name: str, factory: object) -> Callable[[Mapping[str, object]], Any]:
     if not callable(factory):
         raise RigNotFoundError(
             f"rig {name} is a {type(factory).__name__}, not a function that makes a rig; check its name"
         )
-    return factory  # type: ignore[no-any-return]  # what it returns is checked by the caller
-
-
-def _entries() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
-
-
-def _package(entry: EntryPoint) -> str:
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else ""
+    return factory

@@ -38,7 +38,7 @@ def registry() -> Registry:
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         try:
             method = entry.load()
-        except Exception as error:  # noqa: BLE001  foreign code: whatever it raises, the application starts
+        except (Exception, SystemExit) as error:  # noqa: BLE001  foreign code: whatever it raises, the application starts
             broken[entry.name] = f"plug-in {entry.value} failed to load: {error}"
             continue
         if isinstance(method, Method) and method.name not in methods:

@@ -4,6 +4,7 @@ from functools import lru_cache
 
 from backend.contract.rigs import RigOffer
 from backend.devices import loading
+from backend.devices.plug_ins import PlugInPendingError
 from backend.devices.rig_file import RigFile
 from backend.devices.rig_shelf import KeptRig, RigShelf
 from backend.domain.errors import UnglareError
@@ -28,11 +29,23 @@ def _kept(rig: KeptRig) -> RigOffer:
     return offer.model_copy(update={"title": file.title or offer.title})
 
 
-@lru_cache(maxsize=64)
 def _offer(name: str, package: str) -> RigOffer:
+    """Describe a rig; a package that is still being imported is asked again the next time."""
+    try:
+        return _settled_offer(name, package)
+    except PlugInPendingError as error:
+        return RigOffer(
+            name=name, title=_title(name), doc=package, options_schema={}, error=error.sentence
+        )
+
+
+@lru_cache(maxsize=64)
+def _settled_offer(name: str, package: str) -> RigOffer:
     offer = RigOffer(name=name, title=_title(name), doc=package, options_schema={})
     try:
         schema = loading.options_schema(name)
+    except PlugInPendingError:
+        raise
     except UnglareError as error:
         return offer.model_copy(update={"error": error.sentence})
     named = str(schema.get("title", ""))

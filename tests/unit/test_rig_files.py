@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backend.devices import driver_loading
+from backend.devices import driver_loading, plug_ins
 from backend.devices.drivers.aravis_camera import AravisCamera
 from backend.devices.drivers.page_projector import PageProjector
 from backend.devices.errors import RigConfigError, RigNotFoundError
@@ -158,13 +158,13 @@ def test_drivers_of_packages_are_found_and_a_broken_one_stops_only_its_rig(
         EntryPoint("gone", "no.such.module:make", driver_loading.CAMERAS),
     ]
     monkeypatch.setattr(
-        driver_loading, "entry_points", lambda group: [e for e in here if e.group == group]
+        plug_ins, "entry_points", lambda group: [e for e in here if e.group == group]
     )
     assert driver_loading.available_drivers(driver_loading.CAMERAS) == ("aravis", "acme", "gone")
     with pytest.raises(
         RigConfigError, match="left: driver acme failed with RuntimeError: no licence"
     ):
         driver_loading.make_camera("left", "acme", {})
-    with pytest.raises(RigConfigError, match="left: driver gone can't be loaded"):
+    with pytest.raises(RigConfigError, match="left: camera gone can't be loaded"):
         driver_loading.make_camera("left", "gone", {})
     assert driver_loading.make_camera("left", "aravis", {"address": "192.0.2.2"}).name == "left"

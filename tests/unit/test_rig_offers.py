@@ -6,14 +6,14 @@ import pytest
 
 from backend.devices import loading
 from backend.devices.errors import RigNotFoundError
-from backend.services.rig_offers import _offer, offer_rigs
+from backend.services.rig_offers import _settled_offer, offer_rigs
 
 
 @pytest.fixture(autouse=True)
 def fresh() -> Iterator[None]:
-    _offer.cache_clear()
+    _settled_offer.cache_clear()
     yield
-    _offer.cache_clear()
+    _settled_offer.cache_clear()
 
 
 def test_the_simulated_rig_is_offered_with_its_options() -> None:
