@@ -40,8 +40,11 @@ from backend.devices.protocols import (
     Rig,
     SequenceProjector,
     TriggerSource,
+    Wired,
 )
 from backend.domain.errors import UnglareError
+
+_UNWIRED = {TriggerSource.SOFTWARE, TriggerSource.FREE_RUN}
 
 
 class RigConformance:
@@ -123,7 +126,7 @@ class RigConformance:
         """`configure` returns what holds, within the camera's increments."""
         for camera in rig.cameras.values():
             allowed = camera.capabilities.exposure_us
-            wanted = 0.25 * allowed.min + 0.75 * min(allowed.max, 100_000.0)
+            wanted = 0.25 * allowed.min + 0.75 * min(allowed.max, max(allowed.min, 100_000.0))
             taken = camera.configure(replace(camera.settings, exposure_us=wanted))
             assert taken == camera.settings
             assert abs(taken.exposure_us - wanted) <= max(allowed.inc, 1e-6 * wanted)
@@ -163,7 +166,7 @@ class RigConformance:
         camera = _first(rig)
         others = set(camera.capabilities.pixel_formats) - {camera.settings.pixel_format}
         with _armed(rig):
-            camera.configure(replace(camera.settings, exposure_us=self.exposure_us))
+            camera.configure(replace(camera.settings, exposure_us=self._exposure_us(camera)))
             for other in others:
                 with pytest.raises(FeatureError, match="disarm"):
                     camera.configure(replace(camera.settings, pixel_format=other))
@@ -210,7 +213,7 @@ class RigConformance:
 
     def test_no_trigger_no_frame(self, rig: Rig) -> None:
         """Without a trigger `get_frame` times out, in about the time given."""
-        camera = _first(rig)
+        camera = _triggered(rig)
         with _armed(rig):
             start = time.monotonic()
             with pytest.raises(DeviceTimeout, match=camera.name):
@@ -219,14 +222,14 @@ class RigConformance:
 
     def test_trigger_needs_arming(self, rig: Rig) -> None:
         """A camera that isn't armed can't be triggered."""
-        camera = _first(rig)
+        camera = _triggered(rig)
         camera.disarm()
         with pytest.raises(FeatureError, match="arm"):
             camera.trigger()
 
     def test_abort_unblocks(self, rig: Rig) -> None:
         """`abort` from another thread ends a wait at once; the camera can be armed again."""
-        camera = _first(rig)
+        camera = _triggered(rig)
         camera.arm()
         ended: list[float] = []
 
@@ -246,10 +249,36 @@ class RigConformance:
         with _armed(rig):
             _shot(camera)
 
+    def test_free_run_brings_frames_by_itself(self, rig: Rig) -> None:
+        """In free run frames come without a trigger, which is refused; `abort` ends it."""
+        camera = _first(rig)
+        if TriggerSource.FREE_RUN not in camera.capabilities.trigger_sources:
+            pytest.skip(f"{camera.name} has no free run")
+        camera.configure(
+            replace(
+                camera.settings,
+                exposure_us=self._exposure_us(camera),
+                trigger=TriggerSource.FREE_RUN,
+            )
+        )
+        camera.arm()
+        ids = [camera.get_frame(5.0).frame_id for _ in range(3)]
+        assert ids == sorted(set(ids))
+        with pytest.raises(FeatureError, match="Software"):
+            camera.trigger()
+        camera.abort()
+        assert camera.state is LinkState.READY
+        with pytest.raises(DeviceTimeout, match="arm again"):
+            camera.get_frame(timeout_s=0.05)
+        camera.arm()
+        assert camera.get_frame(5.0).frame_id > ids[-1]
+        camera.disarm()
+
     def test_reconnect_applies_settings_again(self, rig: Rig) -> None:
         """After `reconnect` the camera is READY with the settings of before."""
         camera = _first(rig)
-        wanted = camera.configure(replace(camera.settings, exposure_us=2 * self.exposure_us))
+        longer_us = self._exposure_us(camera, times=2)
+        wanted = camera.configure(replace(camera.settings, exposure_us=longer_us))
         camera.reconnect()
         assert camera.state is LinkState.READY
         assert camera.settings == wanted
@@ -282,19 +311,15 @@ class RigConformance:
         projector = rig.projector
         if not isinstance(projector, SequenceProjector):
             pytest.skip("the projector has no hardware-timed sequences")
-        lines = {TriggerSource.LINE0, TriggerSource.LINE1}
-        wired = lines & set(_first(rig).capabilities.trigger_sources)
-        if not wired:
-            pytest.skip("the cameras have no trigger line")
+        lines = _lines(rig)
         projector.load([_uniform(projector, 50 * index) for index in range(5)])
-        for camera in rig.cameras.values():
-            camera.configure(
-                replace(camera.settings, exposure_us=self.exposure_us, trigger=min(wired))
-            )
+        for name, line in lines.items():
+            camera = rig.cameras[name]
+            camera.configure(replace(camera.settings, exposure_us=self.exposure_us, trigger=line))
             camera.arm(5)
         projector.arm_sequence(range(5), self.exposure_us, self.exposure_us + 20_000)
         projector.start_sequence()
-        for camera in rig.cameras.values():
+        for camera in (rig.cameras[name] for name in lines):
             frames = [camera.get_frame() for _ in range(5)]
             camera.disarm()
             assert [f.frame_id - frames[0].frame_id for f in frames] == list(range(5))
@@ -302,6 +327,11 @@ class RigConformance:
                 means = [float(frame.data.mean()) for frame in frames]
                 assert means == sorted(means)
                 assert means[-1] > means[0] + 1
+
+    def _exposure_us(self, camera: Camera, *, times: float = 1.0) -> float:
+        """Return the suite's exposure, or a multiple of it, as far as the camera can be set to it."""
+        allowed = camera.capabilities.exposure_us
+        return allowed.nearest(min(max(times * self.exposure_us, allowed.min), allowed.max))
 
     # ------------------------------------------------------------ light
 
@@ -384,8 +414,32 @@ def _first(rig: Rig) -> Camera:
     return next(iter(rig.cameras.values()))
 
 
+def _triggered(rig: Rig) -> Camera:
+    """Return the first camera, if it can be triggered by software."""
+    camera = _first(rig)
+    if TriggerSource.SOFTWARE not in camera.capabilities.trigger_sources:
+        pytest.skip(f"{camera.name} runs freely, it has no software trigger")
+    return camera
+
+
+def _lines(rig: Rig) -> dict[str, TriggerSource]:
+    """Return the trigger lines of the cameras that the projector drives."""
+    if isinstance(rig, Wired):
+        lines = dict(rig.trigger_lines)
+    else:  # a rig that doesn't say is wired to the first line of every camera
+        lines = {
+            name: min(there)
+            for name, camera in rig.cameras.items()
+            if (there := set(camera.capabilities.trigger_sources) - _UNWIRED)
+        }
+    if not lines:
+        pytest.skip("no camera is wired to the projector's trigger output")
+    return lines
+
+
 def _shot(camera: Camera, timeout_s: float = 5.0) -> Frame:
-    camera.trigger()
+    if camera.settings.trigger is TriggerSource.SOFTWARE:
+        camera.trigger()
     return camera.get_frame(timeout_s)
 
 
