@@ -21,7 +21,10 @@ PROJECTORS = "unglare.projectors"
 _DRIVERS = "backend.devices.drivers"
 _BUILT_IN = {
     CAMERAS: {"aravis": f"{_DRIVERS}.aravis_camera:create_camera"},
-    PROJECTORS: {"page": f"{_DRIVERS}.page_projector:create_projector"},
+    PROJECTORS: {
+        "page": f"{_DRIVERS}.page_projector:create_projector",
+        "dlpc350": f"{_DRIVERS}.dlpc350:create_projector",
+    },
 }
 
 _DEVICE = ("name", "info", "state", "open", "close", "reconnect", "capabilities")

@@ -93,6 +93,21 @@ class SimulatedProjector(Display):
         """Stop a running sequence."""
         self._stop.set()
 
+    # what a controller of its own drives (see `backend.devices.peers.dlpc350`)
+
+    def now_s(self) -> float:
+        """Return the rig's time."""
+        return self._clock.now_s()
+
+    def light(self, picture: UInt8[np.ndarray, "h w"]) -> None:
+        """Show a picture at once, whatever is loaded."""
+        self.shown = Shown(self._frozen(picture), self.shown.number + 1)
+
+    def edge(self, time_s: float, shown_us: float) -> None:
+        """Fire the trigger line for what is shown since a time, for so long."""
+        for fire in self.trigger_lines:
+            fire(self.shown, time_s, shown_us)
+
     def _present(
         self, pattern: UInt8[np.ndarray, "h w"], index: int, *, settle: bool = True
     ) -> Presented:
