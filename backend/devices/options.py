@@ -1,6 +1,6 @@
 """Options of rigs and drivers as pydantic models, refused in one sentence."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -30,6 +30,17 @@ class DeviceOptions(BaseModel):
 
 
 AnyOptions = TypeVar("AnyOptions", bound=DeviceOptions)
+AnyFactory = TypeVar("AnyFactory", bound=Callable[..., object])
+
+
+def takes(model: type[DeviceOptions]) -> Callable[[AnyFactory], AnyFactory]:
+    """Declare the options of a factory of cameras, projectors or rigs: lists and forms show them."""
+
+    def declared(factory: AnyFactory) -> AnyFactory:
+        factory.options_model = model  # type: ignore[attr-defined]  # read by loading.schema_of
+        return factory
+
+    return declared
 
 
 def read_options(model: type[AnyOptions], device: str, options: Mapping[str, Any]) -> AnyOptions:
