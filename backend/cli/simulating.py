@@ -1,6 +1,8 @@
 """`unglare simulate-hardware`: cameras on the network that look at a monitor of this machine."""
 
-from contextlib import closing, suppress
+import signal
+import threading
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -59,7 +61,7 @@ def simulate_hardware(
     """
     from backend.devices.loading import DEFAULT_METHOD, rig_for
     from backend.services.kiosk import Kiosk, listed_monitors
-    from backend.services.simulated_hardware import Hardware, SimulatedHardware, until_interrupted
+    from backend.services.simulated_hardware import Hardware, SimulatedHardware
 
     quiet_logging()
     options = parse_rig_options(rig_options, scene=scene, size=size, seed=seed)
@@ -75,11 +77,20 @@ def simulate_hardware(
         seed=seed or 0,
         page=page,
     )
-    with closing(SimulatedHardware(hardware)) as simulated, suppress(KeyboardInterrupt):
+    ended = _told_to_end()
+    with closing(SimulatedHardware(hardware)) as simulated:
         if write_rig is not None:
             simulated.write_rig(write_rig)
             typer.echo(f"The rig file is {write_rig}; keep it: unglare rigs add {write_rig}")
         for process in simulated.peers:
             typer.echo(f"Camera {process.peer.camera} answers at {process.peer.address}.")
         typer.echo(f"They look at monitor {hardware.monitor}. Stop with Ctrl+C.")
-        simulated.run(until_interrupted)
+        simulated.run(ended.wait)
+
+
+def _told_to_end() -> threading.Event:
+    """Return what is set by Ctrl+C and by SIGTERM, also where a shell has switched Ctrl+C off for us."""
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: ended.set())
+    return ended

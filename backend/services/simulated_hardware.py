@@ -1,6 +1,5 @@
 """Simulated hardware: cameras on the network that look at a monitor, and the rig file that goes with them."""
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -163,12 +162,6 @@ class SimulatedHardware:
     def close(self) -> None:
         """Take the cameras off the network."""
         self._stack.close()
-
-
-def until_interrupted(left_s: float) -> bool:
-    """Wait; Ctrl+C comes as KeyboardInterrupt."""
-    time.sleep(left_s)
-    return False
 
 
 def rig_file(rig: Rig, hardware: Hardware) -> dict[str, Any]:

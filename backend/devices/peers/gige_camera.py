@@ -82,6 +82,7 @@ class GigECamera:
         self._client: tuple[str, int] | None = None
         self._heard_s = 0.0
         self._acquiring = threading.Event()
+        self._acquisitions = 0
         self._ending = threading.Event()
         self._threads: list[threading.Thread] = []
         self._blocks: OrderedDict[int, Block] = OrderedDict()
@@ -350,6 +351,7 @@ class GigECamera:
     # ------------------------------------------------------------ acquisition
 
     def _start_acquisition(self) -> None:
+        self._acquisitions += 1
         self._camera.arm()
         self._blocks.clear()
         self._block_id, self._free_at_s = 0, 0.0
@@ -376,6 +378,7 @@ class GigECamera:
         while not self._ending.is_set():
             if not self._acquiring.wait(_POLL_S):
                 continue
+            acquisition = self._acquisitions
             try:
                 frame = self._camera.get_frame(timeout_s=_POLL_S)
             except DeviceTimeout:
@@ -387,7 +390,8 @@ class GigECamera:
             except DeviceError as error:
                 log.warning("No frame is sent: %s", error)
                 continue
-            if self._acquiring.is_set():
+            # A picture that took so long that acquisition was started anew meanwhile belongs to nobody.
+            if self._acquiring.is_set() and acquisition == self._acquisitions:
                 self._send_block(frame)
 
     def _send_block(self, frame: Frame) -> None:

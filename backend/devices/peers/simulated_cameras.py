@@ -37,7 +37,9 @@ class Peer:
     wire: Wire
 
 
-def make_rig(name: str, options: Mapping[str, Any], light: Light) -> SimulatedRig | SimulatedLcdRig:
+def make_rig(
+    name: str, options: Mapping[str, Any], light: Light | None
+) -> SimulatedRig | SimulatedLcdRig:
     """Make a simulated rig that something outside lights; nothing is opened yet.
 
     Raises
@@ -112,6 +114,7 @@ def _serve(peer: Peer, light: Light, told: Connection) -> None:
         signal.SIGINT, signal.SIG_IGN
     )  # Ctrl+C is for who started this, and ends it in order
     try:
+        _warm_up(peer)
         rig = make_rig(peer.rig, peer.options, light)
         with rig, GigECamera(rig.cameras[peer.camera], peer.address, peer.wire):
             told.send("")
@@ -120,6 +123,15 @@ def _serve(peer: Peer, light: Light, told: Connection) -> None:
         _tell(told, error.sentence)
     except OSError as error:
         _tell(told, _address_problem(error))
+
+
+def _warm_up(peer: Peer) -> None:
+    """Take a picture by the rig's own light: compiling its kernels would make the first real one late."""
+    with make_rig(peer.rig, peer.options, None) as rig:
+        camera = rig.cameras[peer.camera]
+        camera.arm()
+        camera.trigger()
+        camera.get_frame()
 
 
 def _wait_for_end(told: Connection) -> None:
