@@ -96,6 +96,7 @@ def build_services(
         events=events,
         version=version("unglare"),
         offers=lambda: rig_offers(settings, shelf),
+        shelf=shelf,
     )
 
 

@@ -223,7 +223,7 @@ class RigWork(Message):
     """What was started at a rig last: its latency calibration, or a trial."""
 
     kind: str
-    """`latency` or `trial`."""
+    """In words: latency calibration, or trial."""
     status: WorkStatus
     who: str
     progress: float

@@ -181,6 +181,14 @@ def picture_of(pattern: str, width_px: int, height_px: int, label: str) -> UInt8
     return drawn
 
 
+def refuse_pattern(pattern: str, size_px: tuple[int, int]) -> None:
+    """Refuse what a projector of this size can't show; InvalidSettingError."""
+    if pattern not in PATTERNS:
+        raise InvalidSettingError(f"There is no pattern {pattern!r}: choose {', '.join(PATTERNS)}.")
+    if pattern not in (*_EVEN, GRAY):
+        picture_of(pattern, *size_px, "")
+
+
 def _within(limits: Range, value: float) -> float:
     return min(max(value, limits.min), limits.max)
 

@@ -94,6 +94,8 @@ class RigStatus:
     """Somebody looks at live pictures."""
     wish: LiveWish | None
     """How they are taken."""
+    facts: RigFacts | None = None
+    """Of the open rig."""
 
 
 class Lease:
@@ -313,6 +315,7 @@ class _Slot:
         self._options: str | None = None
         self._asked_options: Mapping[str, Any] | None = None
         self._devices: tuple[KnownDevice, ...] = ()
+        self._facts: RigFacts | None = None
         self._link = RigLink.CLOSED
         self._failure: str | None = None
         self._bench: LiveBench | None = None
@@ -341,6 +344,7 @@ class _Slot:
             devices=self._devices,
             is_live=self._is_wanted(),
             wish=self.wish,
+            facts=self._facts,
         )
 
     def take(self, owner: Owner) -> None:
@@ -511,7 +515,7 @@ class _Slot:
             rig.open()
         try:
             self._tell_opened(self.name, _canonical(options), rig)
-            self._devices = _known(rig)
+            self._devices, self._facts = _known(rig), rig.facts()
         except BaseException:
             rig.close()
             raise
@@ -537,7 +541,7 @@ class _Slot:
     def _forget(self) -> None:
         """Know no rig any more: it is closed, or left behind."""
         self._rig, self._options, self._threads, self._devices = None, None, None, ()
-        self._bench, self._link = None, RigLink.CLOSED
+        self._bench, self._facts, self._link = None, None, RigLink.CLOSED
         self.live.clear()
         self._publish(RigChanged(rig=self.name))
 

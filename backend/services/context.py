@@ -6,6 +6,7 @@ from datetime import datetime
 
 from backend.contract.rigs import RigOffer
 from backend.contract.scans import ScanSummary
+from backend.devices.rig_shelf import RigShelf
 from backend.jobs.rigs import RigPool
 from backend.jobs.runner import Runner
 from backend.methods import Registry
@@ -32,6 +33,8 @@ class Context:
     rig_patience_s: float = 0.05
     """How long a new scan waits for its rig's facts; later they come by themselves."""
     offers: Callable[[], tuple[RigOffer, ...]] = offer_rigs
+    shelf: RigShelf | None = None
+    """The station's rig files; None: there are none."""
     previews: Memory[bytes] = field(default_factory=lambda: Memory(64 << 20, len))
     """Pictures for the screen, up to so many bytes."""
     shown: Memory[ShownResult] = field(default_factory=lambda: Memory(500))

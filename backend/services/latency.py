@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
+from pydantic import TypeAdapter
 
 from backend.devices.protocols import (
     CameraCapabilities,
@@ -134,6 +135,15 @@ class Latency:
         path.write_text(json.dumps(asdict(self), indent=1) + "\n")
         return path
 
+    @classmethod
+    def kept(cls, folder: Path, rig: str) -> "Latency | None":
+        """Read what was kept for a rig; None if nothing was, or it can't be read."""
+        try:
+            text = (folder / f"{rig}{LATENCY_SUFFIX}").read_text("utf-8")
+            return TypeAdapter(cls).validate_json(text)
+        except (OSError, ValueError):
+            return None
+
 
 def measure_latency(
     context: Context,
@@ -142,8 +152,12 @@ def measure_latency(
     progress: Progress,
     *,
     repetitions: int = REPETITIONS,
+    who: str = "rigs latency",
+    clock: Clock | None = None,
 ) -> Latency:
     """Measure the latency of a rig's projector, from black to white and back.
+
+    `who` owns the rig meanwhile. It can be cancelled by whatever `progress` or the clock's `sleep` raises.
 
     Raises
     ------
@@ -152,12 +166,14 @@ def measure_latency(
     StageFailedError
         If the cameras don't see the projector's light, or it doesn't settle at all.
     """
-    with context.rigs.lease(
-        name, options, Owner("", "latency calibration", "rigs latency")
-    ) as lease:
+    with context.rigs.lease(name, options, Owner("", "latency calibration", who)) as lease:
         return lease.call(
             lambda rig: latency_of(
-                rig.projector, tuple(rig.cameras.values()), progress, repetitions=repetitions
+                rig.projector,
+                tuple(rig.cameras.values()),
+                progress,
+                repetitions=repetitions,
+                clock=clock,
             )
         )
 

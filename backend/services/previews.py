@@ -61,7 +61,7 @@ def draw(
     """
     picture = array[..., None] if array.ndim == 1 else array
     if picture.ndim == 3 and picture.shape[2] == 3 and picture.dtype == np.uint8:
-        return _encoded(_smaller(picture, max_px, smooth=True), None, format)
+        return encoded(_smaller(picture, max_px, smooth=True), None, format)
     if picture.ndim != 2:
         raise InvalidSettingError(
             f"An array of shape {array.shape} can't be drawn: it has to be height x width."
@@ -85,14 +85,14 @@ def _draw_picture(
     finite = np.isfinite(number)
     scale = 255.0 / max(end - start, _TINY)
     level = np.clip((np.where(finite, number, start) - start) * scale, 0, 255).astype(np.uint8)
-    return _encoded(_coloured(level, colormap), finite, format)
+    return encoded(_coloured(level, colormap), finite, format)
 
 
 def _draw_mask(labels: Array, max_px: int, format: Format) -> bytes:
     small = _smaller(labels, max_px, smooth=False)
     number = np.nan_to_num(small.astype(np.float32), nan=0.0).astype(np.int64)
     table = np.array([_rgb(colour) for colour in LABEL_COLOURS], np.uint8)
-    return _encoded(table[(number - 1) % len(table)], number != 0, format)
+    return encoded(table[(number - 1) % len(table)], number != 0, format)
 
 
 def _limits(values: Array, low: float | None, high: float | None) -> tuple[float, float]:
@@ -138,9 +138,10 @@ def _coloured(level: UInt8[np.ndarray, "h w"], colormap: str) -> UInt8[np.ndarra
     return np.asarray(cv2.applyColorMap(level, _COLORMAPS[colormap])[..., ::-1], dtype=np.uint8)
 
 
-def _encoded(
+def encoded(
     rgb: UInt8[np.ndarray, "h w 3"], valid: Bool[np.ndarray, "h w"] | None, format: Format
 ) -> bytes:
+    """Write a picture; what isn't valid is transparent in a PNG, and has the background's colour in a JPEG."""
     if format == "jpeg":
         if valid is not None:
             rgb = np.where(valid[..., None], rgb, np.array(BACKGROUND_RGB, np.uint8))
@@ -162,11 +163,6 @@ def _written(suffix: str, picture: Array, options: list[int]) -> bytes:
 
 def _rgb(colour: str) -> tuple[int, int, int]:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-def live_jpeg(gray: Array, bit_depth: int, max_px: int = 960) -> bytes:
-    """Encode a camera's picture for the live view: full scale is white."""
-    return draw(gray, max_px=max_px, low=0.0, high=float(2**bit_depth - 1), format="jpeg")
 
 
 def value_at(array: Array, x: int, y: int) -> Any:

@@ -63,15 +63,17 @@ class RigTrial:
         return {"rig": self.name, "ok": not self.problems, **asdict(self)}
 
 
-def try_rig(context: Context, name: str, options: Mapping[str, Any]) -> RigTrial:
-    """Open a rig and take a white and a black frame with every camera.
+def try_rig(
+    context: Context, name: str, options: Mapping[str, Any], *, who: str = "rigs check"
+) -> RigTrial:
+    """Open a rig and take a white and a black frame with every camera; `who` owns it meanwhile.
 
     Raises
     ------
     UnglareError
         If the rig can't be opened, is busy, or a device fails: the sentence names it.
     """
-    with context.rigs.lease(name, options, Owner("", "check", "rigs check")) as lease:
+    with context.rigs.lease(name, options, Owner("", "check", who)) as lease:
         return lease.call(lambda rig: _try(name, rig))
 
 

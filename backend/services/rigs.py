@@ -19,7 +19,6 @@ from backend.domain.errors import StageUnavailableError, UnglareError
 from backend.domain.rig import PinholeModel, Pose, RigCalibration, RigFacts
 from backend.jobs.rigs import RigGiven
 from backend.services.context import Context
-from backend.services.previews import live_jpeg
 from backend.storage.codec import decode
 
 _PER_EDGE = 8
@@ -60,15 +59,6 @@ def check_rig(context: Context, name: str, options: Mapping[str, Any]) -> RigChe
     except UnglareError as error:
         return RigCheck(name=name, ok=False, lines=(error.sentence,))
     return RigCheck(name=name, ok=True, lines=lines)
-
-
-def live_frame(context: Context, rig: str, camera: str) -> bytes | None:
-    """Return the newest picture of a camera as JPEG, None if there is none; never waits."""
-    picture = context.rigs.live(rig, camera)
-    if picture is None:
-        return None
-    key = ("live", rig, camera, picture.number)
-    return context.previews.get(key, lambda: live_jpeg(picture.gray, picture.bit_depth))
 
 
 def rig_view(name: str, title: str, options: Mapping[str, Any], rig: RigGiven) -> RigView:

@@ -26,6 +26,7 @@ from backend.contract.scans import (
     ScanState,
     ScanSummary,
 )
+from backend.devices.rig_shelf import RigShelf
 from backend.domain.errors import ConflictError
 from backend.domain.shots import Progress
 from backend.jobs.loading import load_scan
@@ -48,9 +49,11 @@ from backend.services.array_uploads import UploadKind, store_upload
 from backend.services.context import Context
 from backend.services.events import EventHub
 from backend.services.export_folder import refuse_foreign
+from backend.services.live_pictures import LIVE_PX, Crop, live_frame
 from backend.services.pixels import levels_at
 from backend.services.points import pack_points
 from backend.services.previews import Format, Kind, draw, value_at
+from backend.services.rig_desk import RigDesk
 from backend.services.rig_offers import offer_rigs
 from backend.services.states import scan_state
 from backend.storage.artifacts import ArtifactStore
@@ -75,6 +78,8 @@ class Services:
         How long the answer to a new scan waits for its rig's facts [s]; later they come by themselves.
     offers
         Which rigs there are to choose from.
+    shelf
+        The station's rig files, for what is kept beside them.
     """
 
     def __init__(
@@ -90,6 +95,7 @@ class Services:
         clock: Callable[[], datetime] = utc_now,
         rig_patience_s: float = 0.05,
         offers: Callable[[], tuple[RigOffer, ...]] = offer_rigs,
+        shelf: RigShelf | None = None,
     ) -> None:
         self.context = Context(
             database=database,
@@ -102,7 +108,10 @@ class Services:
             clock=clock,
             rig_patience_s=rig_patience_s,
             offers=offers,
+            shelf=shelf,
         )
+        self.rig_desk = RigDesk(self.context)
+        """Rigs without a scan: devices, live pictures, latency."""
         self._closed = False
 
     @property
@@ -119,6 +128,7 @@ class Services:
         if self._closed:
             return
         self._closed = True
+        self.rig_desk.close()
         self.context.runner.close()
         self.context.rigs.close()
         self.context.database.close()
@@ -352,6 +362,14 @@ class Services:
         """Open a rig and say who its devices are; see `rigs.check_rig`."""
         return rigs.check_rig(self.context, name, options)
 
-    def live_frame(self, rig: str, camera: str) -> bytes | None:
-        """Return the newest picture of a camera as JPEG; never waits."""
-        return rigs.live_frame(self.context, rig, camera)
+    def live_frame(
+        self,
+        rig: str,
+        camera: str,
+        *,
+        max_px: int = LIVE_PX,
+        marks: bool = False,
+        crop: Crop | None = None,
+    ) -> bytes | None:
+        """Return the newest picture of a camera as JPEG; never waits. See `live_pictures.live_jpeg`."""
+        return live_frame(self.context, rig, camera, max_px=max_px, marks=marks, crop=crop)

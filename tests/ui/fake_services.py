@@ -39,6 +39,7 @@ from backend.domain.states import JobStatus, StageStatus, Verdict
 from backend.services import previews
 from backend.services.array_uploads import UploadKind
 from backend.services.events import EventHub
+from backend.services.live_pictures import live_jpeg
 from backend.services.services import Services
 from tests.ui.fake_methods import METHODS, FakeStage
 from tests.ui.fake_rig import OFFERS, describe, pack_points, rig_view
@@ -97,8 +98,8 @@ class FakeServices(Services):
     def scan_rig(self, scan: str) -> RigView:
         return rig_view(self.find(scan).rig_options)
 
-    def live_frame(self, rig: str, camera: str) -> bytes | None:
-        return previews.live_jpeg(scene().white(camera, PICTURE_MS), 8, 640)
+    def live_frame(self, rig: str, camera: str, **wishes: Any) -> bytes | None:
+        return live_jpeg(scene().white(camera, PICTURE_MS), 8, 640)
 
     def scan(self, scan: str) -> ScanState:
         with self._lock:

@@ -9,7 +9,8 @@ import pytest
 from app import palette
 from backend.contract.colours import BACKGROUND_RGB
 from backend.domain.errors import InvalidSettingError, NotFoundError
-from backend.services.previews import draw, live_jpeg, value_at
+from backend.services.live_pictures import live_jpeg
+from backend.services.previews import draw, value_at
 
 
 def seen(picture: bytes) -> np.ndarray[Any, Any]:
