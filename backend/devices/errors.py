@@ -68,6 +68,10 @@ class IncompleteFrame(DeviceError):
     retryable = True
 
 
+class OutOfSync(DeviceError):
+    """A camera's frame doesn't show what it was taken for, again and again: the display lags, tears or drops patterns."""
+
+
 class GeometryError(DeviceError):
     """A pattern doesn't fit the display pixel by pixel: scaled, resized, or on another screen."""
 

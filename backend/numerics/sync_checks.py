@@ -1,4 +1,4 @@
-r"""Do frames show what they were taken for? Residuals of sets that belong together, blind to noise.
+r"""Whether frames show what they were taken for: residuals of sets that belong together, blind to noise.
 
 A frame that is late, torn or of another pattern differs from the right one by a *picture*: neighbouring pixels deviate
 alike. Noise doesn't. So every deviation here is measured as a covariance of neighbours, whose expectation is free of the
@@ -323,7 +323,7 @@ def _part(picture: Any, band: int) -> Any:
 
 
 def _all_valid(frames: Sequence[FrameSample]) -> Valid:
-    return np.logical_and.reduce([f.valid for f in frames])
+    return np.asarray(np.logical_and.reduce([f.valid for f in frames]))
 
 
 def _widened(saturated: Bool[np.ndarray, "pair 2 w"]) -> Valid:

@@ -1,6 +1,7 @@
 """Capture plans on the toy rig: journal, resume, re-shoot, cancel, waiting, what the devices are told."""
 
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -29,6 +30,7 @@ from backend.domain.patterns import (
     Uniform,
 )
 from backend.domain.shots import Exposed, Plan, Shot, Until
+from backend.jobs import shooting
 from backend.jobs.capture import CaptureSession
 from backend.jobs.control import JobControl, Live
 from backend.jobs.journal import shot_hash
@@ -253,11 +255,49 @@ def test_a_lasting_failure_ends_the_capture_and_keeps_the_frames(bench: Bench) -
     assert bench.rig.shots == 5 + 6, "the first two shots count"
 
 
-def test_a_lost_device_isnt_tried_again(bench: Bench) -> None:
-    bench.faults.errors = {1: [DeviceDisconnected("right", "the link is gone")]}
-    with pytest.raises(RigFailedError, match="right: the link is gone; 0 captured frames are kept"):
+def test_a_lost_device_is_fetched_back_and_the_shot_taken_again(bench: Bench) -> None:
+    bench.faults.errors = {3: [DeviceDisconnected("right", "the link is gone")]}
+    (frames,) = bench.drive(fringe_plan(FRINGES))
+    assert len(frames) == 16
+    assert bench.rig.shots == 8 + 1
+    assert bench.rig.cameras["right"].reconnects == 1
+    assert bench.rig.cameras["left"].reconnects == 0
+    assert any("right is lost, waiting for it" in live.text for live in bench.told)
+
+
+def test_a_lost_projector_gets_its_patterns_again(bench: Bench) -> None:
+    bench.faults.errors = {3: [DeviceDisconnected("projector", "the page was closed")]}
+    bench.faults.before_shot = bench.rig.projector.fail
+    (frames,) = bench.drive(fringe_plan(FRINGES))
+    assert len(frames) == 16
+    assert bench.rig.projector.reconnects == 1
+    assert bench.rig.projector.loads == 2
+
+
+def test_a_device_that_doesnt_come_back_ends_the_capture_and_keeps_the_frames(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shooting, "RECONNECT_S", 0.2)
+    bench.faults.gone = True
+    bench.faults.errors = {3: [DeviceDisconnected("right", "the link is gone")]}
+    with pytest.raises(RigFailedError, match="right: the link is gone for good; 4 captured frames"):
         bench.drive(fringe_plan(FRINGES))
-    assert bench.rig.shots == 1
+    assert bench.rig.shots == 3
+    bench.faults.gone = False
+    bench.rig.open()
+    bench.drive(fringe_plan(FRINGES))
+    assert bench.rig.shots == 3 + 6, "the first two shots count"
+
+
+def test_cancelled_while_a_lost_device_is_waited_for(bench: Bench) -> None:
+    bench.faults.gone = True
+    bench.faults.errors = {2: [DeviceDisconnected("right", "the link is gone")]}
+    began = time.monotonic()
+    threading.Timer(0.3, bench.control.stop, ("bob",)).start()
+    with pytest.raises(CancelledError, match="Cancelled by bob"):
+        bench.drive(fringe_plan(FRINGES))
+    assert time.monotonic() - began < 5.0
+    assert len(bench.journal) == 2
 
 
 def test_cancelled_between_two_shots(bench: Bench) -> None:

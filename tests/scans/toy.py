@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from backend.devices.errors import DeviceBusy, DeviceError, DeviceTimeout
+from backend.devices.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceTimeout
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -360,7 +360,7 @@ ABILITIES = CameraCapabilities(
     (TriggerSource.SOFTWARE,),
 )
 PROJECTOR = DeviceInfo("toy", "projector", "2")
-DISPLAY = ProjectorCapabilities(PROJECTOR_PX)
+DISPLAY = ProjectorCapabilities(PROJECTOR_PX, certain=True)
 
 
 @dataclass
@@ -372,12 +372,18 @@ class Faults:
     before_shot: Callable[[int], None] = lambda shot: None
     """Called by the projector with the number of the shot (1, 2 ...)."""
     before_open: Callable[[], None] = lambda: None
+    gone: bool = False
+    """True: a lost device doesn't come back."""
     hold: threading.Event | None = None
     """While it isn't set, `get_frame` waits."""
 
 
 class Closing:
     """What `with` needs, and the rest of a device's life."""
+
+    name: str
+    rig: Any
+    reconnects = 0
 
     def open(self) -> None:
         self.state = LinkState.READY
@@ -386,6 +392,10 @@ class Closing:
         self.state = LinkState.CLOSED
 
     def reconnect(self, timeout_s: float = 10.0) -> None:
+        self.reconnects += 1
+        if self.rig.faults.gone:
+            self.state = LinkState.LOST
+            raise DeviceDisconnected(self.name, "the link is gone for good")
         self.open()
 
     def __enter__(self) -> Any:
@@ -478,6 +488,12 @@ class ToyProjector(Closing):
         self.rig.faults.before_shot(self.rig.shots)
         self.picture = self.loaded[index]
         return Presented(index, 0.0, None, confirmed=True)
+
+    def fail(self, shot: int) -> None:
+        """Raise what is to go wrong with the projector at a shot: for `Faults.before_shot`."""
+        errors = self.rig.faults.errors.get(shot, [])
+        if errors and errors[0].device == self.name:
+            raise errors.pop(0)
 
     def blank(self, level: int = 0) -> Presented:
         self.picture = np.full(PROJECTOR_PX[::-1], level, np.uint8)
