@@ -6,6 +6,7 @@ DLPC350 holds them: three patterns of 8 bit or 24 of 1 bit each.
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -105,6 +106,86 @@ class PatternSet(_Entry):
                 f"image {path} of a pattern set can't be read as {self.width_px}x{self.height_px} px; export the set anew"
             )
         return np.ascontiguousarray(picture[:, :, ::-1], dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class NewPattern:
+    """A picture that is to be written."""
+
+    picture: UInt8[np.ndarray, "h w"]
+    what: str
+    pattern: dict[str, Any] | None = None
+    stages: tuple[str, ...] = ()
+
+
+def write_set(
+    folder: Path,
+    patterns: Sequence[NewPattern],
+    *,
+    method: str = "",
+    gamma: float = 1.0,
+    pack: bool = False,
+    left_out: Sequence[str] = (),
+) -> PatternSet:
+    """Write pictures as PNG, numbered in their order, and the list of them; packed, also the images for a DLPC350.
+
+    The images are BMP files: the program that builds the projector's flash wants those.
+
+    Raises
+    ------
+    OSError
+        If the folder can't be written.
+    """
+    pictures = [pattern.picture for pattern in patterns]
+    depth = bit_depth_for(pictures)
+    each = 24 // depth
+    digits = max(3, len(str(len(patterns) - 1)))
+    entries = tuple(
+        SetPattern(
+            number=number,
+            file=f"pattern_{number:0{digits}d}.png",
+            what=new.what,
+            stages=new.stages,
+            pattern=new.pattern,
+            hash=pattern_hash(new.picture),
+            image=number // each if pack else None,
+            position=number % each if pack else None,
+        )
+        for number, new in enumerate(patterns)
+    )
+    groups = [pictures[i : i + each] for i in range(0, len(pictures), each)] if pack else []
+    height_px, width_px = pictures[0].shape
+    written = PatternSet(
+        method=method,
+        width_px=width_px,
+        height_px=height_px,
+        gamma=gamma,
+        bit_depth=depth,
+        patterns=entries,
+        images=tuple(f"flash_{number:02d}.bmp" for number in range(len(groups))),
+        left_out=tuple(left_out),
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    for entry, picture in zip(entries, pictures, strict=True):
+        write_picture(folder / entry.file, picture)
+    for name, group in zip(written.images, groups, strict=True):
+        write_picture(folder / name, packed(group, depth)[:, :, ::-1])
+    (folder / INDEX_FILE).write_text(written.model_dump_json(indent=2) + "\n", "utf-8")
+    return written
+
+
+def write_picture(
+    path: Path, picture: UInt8[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"]
+) -> None:
+    """Write a gray picture, or a coloured one as BGR, in the format that the file's name says.
+
+    Raises
+    ------
+    OSError
+        If it can't be written.
+    """
+    _, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture))
+    path.write_bytes(data.tobytes())
 
 
 def pattern_hash(picture: UInt8[np.ndarray, "h w"]) -> str:

@@ -312,13 +312,16 @@ class Dlpc350Projector(Link):
     def _show(self, pattern: SetPattern, index: int) -> Presented:
         run = self._run((pattern,))
         period_us = self._options.show_period_us
+        likely_ms = (
+            self._loading_ms(run.images[0]) + period_us / 1000.0
+        )  # measured while nothing runs
         self._program(run, period_us, period_us, repeat=True)
         self._start(None)
-        return self._settled(index, self._loading_ms(run.images[0]))
+        return self._settled(index, likely_ms)
 
-    def _settled(self, index: int, loading_ms: float) -> Presented:
-        """Wait until the pattern is lit: as long as measured, else as long as its image may take to load."""
-        wait_ms = loading_ms if self.settle_ms is None else self.settle_ms
+    def _settled(self, index: int, likely_ms: float) -> Presented:
+        """Wait until the pattern is lit: as long as measured, else as long as its image takes to load, and a period."""
+        wait_ms = likely_ms if self.settle_ms is None else self.settle_ms
         self._stop.wait(wait_ms / 1000.0)
         return Presented(index, time.monotonic(), None, confirmed=self.settle_ms is not None)
 

@@ -38,6 +38,8 @@ log = logging.getLogger(__name__)
 Picture = UInt8[np.ndarray, "h w"]
 
 _POLL_S = 0.1
+_HANG_UP_S = 0.5
+"""So long a new client waits for one that has just hung up."""
 _FIRMWARE = bytes((0, 0, 1, 4))
 """4.1.0, low byte first."""
 
@@ -256,7 +258,7 @@ class SimulatedDlpc350:
 
     def _serve(self, connection: socket.socket) -> bool:
         """Answer a client in a thread of its own; a second one is hung up on."""
-        if not self._taken.acquire(blocking=False):
+        if not self._taken.acquire(timeout=_HANG_UP_S):
             connection.close()
             return False
         self._client = connection
@@ -410,7 +412,10 @@ class SimulatedDlpc350:
         self._stop_playing()
         self._halt.clear()
         self._action = Action.START
-        self._player = threading.Thread(target=self._play, name="dlpc350-sequence", daemon=True)
+        steps, start_s = self._steps(), self._lamp.now_s() + self._preloading_ms() / 1000.0
+        self._player = threading.Thread(
+            target=self._play, args=(steps, start_s), name="dlpc350-sequence", daemon=True
+        )
         self._player.start()
 
     def _stop_playing(self) -> None:
@@ -421,13 +426,11 @@ class SimulatedDlpc350:
         self._action = Action.STOP
         self._lamp.light(self._black)
 
-    def _play(self) -> None:
-        """Run through the table, once or again and again."""
+    def _play(self, steps: Sequence[_Step], start_s: float) -> None:
+        """Run through a sequence, once or again and again."""
         exposure_us, period_us = protocol.timing_in(self.registers.timing)
         repeats = bool(self.registers.sequence[1])
         delay_s = protocol.trigger_delay_us(self.registers.trigger_out_1[1]) * 1e-6
-        steps = self._steps()
-        start_s = self._lamp.now_s() + self._preloading_ms() / 1000.0
         swapped_s, count, lit = start_s, 0, self._black
         while repeats or count < len(steps):
             step = steps[count % len(steps)]
