@@ -220,11 +220,15 @@ def serve(
 
 @contextlib.contextmanager
 def serve_pages(
-    settings: Settings, *, announce: Callable[[str], None] = _say
+    settings: Settings,
+    *,
+    announce: Callable[[str, str], None],
+    make_runner: Callable[[Workshop], Runner] = InlineRunner,
 ) -> Iterator[tuple[Services, PageDesk]]:
     """Serve projector pages for one command, without the station.
 
-    Yields the services, whose rigs find the pages, and the desk where the pages come in.
+    Yields the services, whose rigs find the pages, and the desk where the pages come in. `announce` is told the
+    server's address and the operators' token.
 
     Raises
     ------
@@ -238,7 +242,7 @@ def serve_pages(
     ):
         port, pages = listening.getsockname()[1], PageDesk()
         with contextlib.closing(
-            build_services(settings, make_runner=InlineRunner, pages=pages)
+            build_services(settings, make_runner=make_runner, pages=pages)
         ) as services:
             bare = settings.model_copy(update={"station": False})
             app = build_application(bare, services, port=port, token=token, pages=pages)
@@ -248,7 +252,7 @@ def serve_pages(
             )
             serving.start()
             try:
-                announce(f"http://{_reachable(settings.host)}:{port}/projector?token={token}")
+                announce(f"http://{_reachable(settings.host)}:{port}", token)
                 yield services, pages
             finally:
                 server.should_exit = True

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from backend.cli.house import open_services
+from backend.cli.house import Monitor, open_services
 from backend.cli.options import (
     AsJson,
     DataFolder,
@@ -25,6 +25,7 @@ def check_rig(
     size: Size = None,
     seed: Seed = None,
     rig_options: RigOptions = None,
+    monitor: Monitor = None,
     data: DataFolder = None,
     as_json: AsJson = False,
 ) -> None:
@@ -34,7 +35,7 @@ def check_rig(
     quiet_logging()
     with answering(as_json) as answer:
         options = parse_rig_options(rig_options, scene=scene, size=size, seed=seed)
-        with open_services(data) as services:
+        with open_services(data, rig=rig, monitor=monitor) as services:
             found = try_rig(services.context, rig, options)
         answer.update(found.document())
         if not as_json:

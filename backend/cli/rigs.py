@@ -1,7 +1,5 @@
 """`unglare rigs`: which rigs this station has, the files that describe them, and whether a rig works."""
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,15 +7,12 @@ import typer
 
 from backend.cli.checking import check_rig
 from backend.cli.discovering import discover
+from backend.cli.house import Monitor, open_services
 from backend.cli.options import AsJson, DataFolder
 from backend.cli.output import answering, console, quiet_logging, table
 
 if TYPE_CHECKING:
     from backend.devices.rig_shelf import RigShelf
-    from backend.services.services import Services
-
-_OPENING_S = 600.0
-"""How long an operator may take to open the projector page."""
 
 
 def register(application: typer.Typer) -> None:
@@ -38,8 +33,6 @@ def register(application: typer.Typer) -> None:
 
 def list_rigs(data: DataFolder = None, as_json: AsJson = False) -> None:
     """List every rig that scans can be made with, and why one can't be used."""
-    from backend.cli.house import open_services
-
     quiet_logging()
     with answering(as_json) as answer, open_services(data) as services:
         offers = services.rigs()
@@ -86,20 +79,20 @@ def remove(
 def latency(
     rig: Annotated[str, typer.Option(help="Name of a rig that is described by a file.")],
     repetitions: Annotated[int, typer.Option(min=3, max=100, help="Changes each way.")] = 10,
+    monitor: Monitor = None,
     data: DataFolder = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure how long after its acknowledgement the projector shows a pattern, and keep it for the rig."""
     from dataclasses import asdict
 
-    from backend.devices.rig_file import RigFile
     from backend.services.latency import measure_latency
 
     quiet_logging()
     with answering(as_json) as answer:
         shelf = _shelf(data)
-        page = RigFile.read(shelf.require(rig)).page
-        with _services_with(page, data) as services:
+        shelf.require(rig)
+        with open_services(data, rig=rig, monitor=monitor) as services:
             found = measure_latency(
                 services.context, rig, {}, _say_progress, repetitions=repetitions
             )
@@ -112,32 +105,6 @@ def latency(
         rows.add_row(f"{delay_ms:.1f} ms", f"{up:.3f}", f"{down:.3f}")
     console().print(rows)
     console().print(f"settle time {found.settle_ms:.1f} ms, kept in {path}")
-
-
-@contextlib.contextmanager
-def _services_with(page: str | None, data: Path | None) -> "Iterator[Services]":
-    """Open the services; where a rig shows its patterns in a page, serve it and wait until it is open."""
-    from backend.cli.house import open_services
-    from backend.domain.errors import StageFailedError
-    from backend.main import serve_pages
-    from backend.settings import load_settings
-
-    if page is None:
-        with open_services(data) as services:
-            yield services
-        return
-    with serve_pages(
-        load_settings(data_folder=data),
-        announce=lambda address: typer.echo(
-            f"Open this page full screen on the projector's monitor, or run `unglare projector`:\n    {address}&name={page}",
-            err=True,
-        ),
-    ) as (services, pages):
-        if pages.find(page, _OPENING_S) is None:
-            raise StageFailedError(
-                f"No projector page {page!r} was opened within {_OPENING_S:g} s: open it full screen, then run this again."
-            )
-        yield services
 
 
 def _say_progress(done: float, text: str = "") -> None:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from backend.cli.house import open_services, who
+from backend.cli.house import Monitor, open_services, who
 from backend.cli.options import (
     AsJson,
     Chain,
@@ -60,6 +60,7 @@ def scan(
     projector_size: ProjectorSize = None,
     seed: Seed = None,
     rig_options: RigOptions = None,
+    monitor: Monitor = None,
     preset: Annotated[str | None, typer.Option(help="Named set of settings of the method.")] = None,
     name: Annotated[str, typer.Option(help="Name of the scan.")] = "",
     out: Out = None,
@@ -85,6 +86,8 @@ def scan(
             seed=seed,
             chain=chain,
         )
+        if resume:
+            rig = _revived(resume, data)
         rig = rig or rig_for(options.get("scene"), method or "")
         method = method or method_for(rig)
         request = CreateScan(
@@ -96,17 +99,22 @@ def scan(
             settings=parse_settings(settings),
             given=parse_given(given),
         )
-        with open_services(data, progress) as services:
+        with open_services(data, progress, rig=rig, monitor=monitor) as services:
             refuse_place(services, out)
             progress.step("rig", 0.0, "opening")
-            if resume:
-                end_dead_job(services, resume, data)
             uploaded = with_uploads(services, method, request.settings)
             request = request.model_copy(update={"settings": uploaded})
             chosen = resume or services.create_scan(request, who()).id
             run_and_export(services, chosen, answer, progress, out=out, frames=frames)
     if not as_json:
         show_summary(answer)
+
+
+def _revived(scan_id: str, data: Path | None) -> str:
+    """Prepare a scan that shall go on, and return its rig: a projector page has to be open before the scan is run."""
+    with open_services(data) as services:
+        end_dead_job(services, scan_id, data)
+        return services.scan(scan_id).rig
 
 
 def end_dead_job(services: "Services", scan_id: str, data: Path | None) -> None:

@@ -1,10 +1,11 @@
 """A browser window that fills the projector's monitor and shows the projector page, pixel by pixel."""
 
+import contextlib
 import html
 import os
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
@@ -89,6 +90,30 @@ class Kiosk:
             If no browser is installed.
         """
         subprocess.run(self.command(monitor, address, name=name, token=token), check=False)  # noqa: S603  our own words
+
+    @contextlib.contextmanager
+    def opened(
+        self, monitor: Monitor, address: str, *, name: str, token: str | None
+    ) -> Iterator[None]:
+        """Show the page as long as the block runs; the window is closed behind it.
+
+        Raises
+        ------
+        StartupError
+            If no browser is installed.
+        """
+        command = self.command(monitor, address, name=name, token=token)
+        # In a group of its own: Ctrl+C is the command's, which closes the window when it is done.
+        browser = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)  # noqa: S603  our own words
+        try:
+            yield
+        finally:
+            browser.terminate()
+            try:
+                browser.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                browser.kill()
+                browser.wait()
 
     def command(self, monitor: Monitor, address: str, *, name: str, token: str | None) -> list[str]:
         """Return the browser's command line."""

@@ -175,9 +175,13 @@ def test_the_stations_own_rig_is_offered_first_and_opened_with_its_options(
 
 
 def test_a_command_may_serve_projector_pages_by_itself(tmp_path: Path) -> None:
-    said: list[str] = []
-    with serve_pages(settings_in(tmp_path, port=0), announce=said.append) as (_, pages):
-        address = httpx.URL(said[0])
+    said: list[tuple[str, str]] = []
+
+    def announce(*door: str) -> None:
+        said.append((door[0], door[1]))
+
+    with serve_pages(settings_in(tmp_path, port=0), announce=announce) as (_, pages):
+        address = httpx.URL(f"{said[0][0]}/projector", params={"token": said[0][1]})
         with httpx.Client(trust_env=False) as client:
             assert client.get(address).status_code == 303
             cookie = "; ".join(f"{name}={value}" for name, value in client.cookies.items())
@@ -191,7 +195,7 @@ def test_a_command_may_serve_projector_pages_by_itself(tmp_path: Path) -> None:
             assert pages.find("bench", 10.0) is not None
         with (
             pytest.raises(StartupError, match="Another server uses the data folder"),
-            serve_pages(settings_in(tmp_path, port=0), announce=said.append),
+            serve_pages(settings_in(tmp_path, port=0), announce=announce),
         ):
             pass
 
