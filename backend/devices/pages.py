@@ -11,6 +11,7 @@ Messages to a page are JSON texts; pixels follow as one binary message of gray b
                     {"t": "error", "id": n, "code": "no-slot"}
 """
 
+import copy
 import json
 import threading
 from collections.abc import Mapping
@@ -156,11 +157,31 @@ class Page:
 
 
 class PageDesk:
-    """The pages of one application, by name; one page a name."""
+    """The pages of one application, by name; one page a name, and one projector a page."""
 
     def __init__(self) -> None:
         self._pages: dict[str, Page] = {}
         self._changed = threading.Condition()
+        self._holders: dict[str, tuple[object, str]] = {}
+        self._rig = ""
+
+    def for_rig(self, rig: str) -> "PageDesk":
+        """Return the same desk, as one rig's projector uses it."""
+        desk = copy.copy(self)
+        desk._rig = rig  # noqa: SLF001  our own copy
+        return desk
+
+    def hold(self, name: str, projector: object) -> str | None:
+        """Take the page of a name for one projector; returns the rig that has it if another one does."""
+        with self._changed:
+            holder, rig = self._holders.setdefault(name, (projector, self._rig))
+            return None if holder is projector else rig
+
+    def let_go(self, name: str, projector: object) -> None:
+        """Give a page back; does nothing where the projector hasn't got it."""
+        with self._changed:
+            if self._holders.get(name, (None, ""))[0] is projector:
+                del self._holders[name]
 
     def join(self, name: str, connection: Connection) -> Page | None:
         """Take a page in; None if there is one of this name already, which keeps working."""

@@ -210,7 +210,9 @@ def assemble(name: str, file: RigFile, desk: PageDesk) -> AssembledRig:
         camera: make_camera(camera, entry.driver, _options(entry))
         for camera, entry in file.cameras.items()
     }
-    projector = make_projector("projector", file.projector.driver, _options(file.projector), desk)
+    projector = make_projector(
+        "projector", file.projector.driver, _options(file.projector), desk.for_rig(name)
+    )
     return AssembledRig(
         name,
         cameras,

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from backend.devices.drivers.page_projector import PageOptions, PageProjector
-from backend.devices.errors import DeviceDisconnected, DeviceTimeout, GeometryError, RigConfigError
+from backend.devices.errors import (
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceTimeout,
+    GeometryError,
+    RigConfigError,
+)
 from backend.devices.options import read_options
 from backend.devices.pages import NOT_OURS, Page, PageDesk
 from backend.devices.protocols import LinkState
@@ -71,6 +77,31 @@ def test_a_late_answer_is_not_taken_for_the_next_drivers(desk: PageDesk) -> None
     browser.answer(browser.asked[0])
     with pytest.raises(DeviceTimeout, match="didn't draw"):
         second.show(0, timeout_s=0.01)
+
+
+def test_a_page_shows_the_patterns_of_one_rig_at_a_time(desk: PageDesk) -> None:
+    Browser(desk)
+    options = PageOptions(size=(64, 48))
+    first, second = (PageProjector("projector", options, desk.for_rig(rig)) for rig in "ab")
+    first.open()
+    with pytest.raises(
+        DeviceBusy, match="page 'projector' shows the patterns of rig a; disconnect"
+    ):
+        second.open()
+    second.close()
+    first.reconnect()
+    first.close()
+    second.open()
+
+
+def test_a_projector_that_cant_open_its_page_leaves_it_to_others(desk: PageDesk) -> None:
+    Browser(desk)
+    wrong, right = (
+        PageProjector("projector", PageOptions(size=size), desk) for size in ((32, 32), (64, 48))
+    )
+    with pytest.raises(GeometryError):
+        wrong.open()
+    right.open()
 
 
 def test_a_lost_page_is_opened_again_and_gets_its_patterns(desk: PageDesk) -> None:

