@@ -98,8 +98,10 @@ class RigDesk:
         )
 
     def connect(self, rig: str, options: Mapping[str, Any]) -> RigState:
-        """Have a rig opened in the background; one that is open stays as it is."""
-        self._title(rig)
+        """Have a rig opened in the background; one that is open stays as it is.
+
+        Nobody is asked whether there is such a rig: a name may be a package's, `module:factory`.
+        """
         self._context.rigs.connect(rig, options)
         return self.state(rig)
 
