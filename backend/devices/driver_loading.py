@@ -20,7 +20,12 @@ PROJECTORS = "unglare.projectors"
 
 _DRIVERS = "backend.devices.drivers"
 _BUILT_IN = {
-    CAMERAS: {"aravis": f"{_DRIVERS}.aravis_camera:create_camera"},
+    CAMERAS: {
+        "aravis": f"{_DRIVERS}.aravis_camera:create_camera",
+        "pylon": f"{_DRIVERS}.pylon_camera:create_camera",
+        "gentl": f"{_DRIVERS}.gentl_camera:create_camera",
+        "video": f"{_DRIVERS}.video_camera:create_camera",
+    },
     PROJECTORS: {
         "page": f"{_DRIVERS}.page_projector:create_projector",
         "dlpc350": f"{_DRIVERS}.dlpc350:create_projector",

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from backend.devices.errors import FeatureError, GeometryError, UnsupportedFeature
-from backend.devices.protocols import CameraCapabilities, CameraSettings, TriggerSource
+from backend.devices.protocols import CameraCapabilities, CameraSettings, Range, TriggerSource
 
 
 def refuse_impossible(camera: str, wanted: CameraSettings, can: CameraCapabilities) -> None:
@@ -74,6 +74,22 @@ def refuse_trigger(camera: str, settings: CameraSettings, *, armed: bool) -> Non
         raise FeatureError(
             camera, f"TriggerSource is {settings.trigger}, not Software; set it before arming"
         )
+
+
+def fixed_exposure(camera: str, exposure_us: float | None) -> Range:
+    """Return the range of a camera whose exposure can't be set, or refuse it if nobody says which it has.
+
+    Raises
+    ------
+    UnsupportedFeature
+        If its exposure isn't known.
+    """
+    if exposure_us is None:
+        raise UnsupportedFeature(
+            camera,
+            "has no exposure that could be set; say in the rig file which it has, e.g. `exposure_us: 20000`",
+        )
+    return Range(exposure_us, exposure_us, 0.0, "us")
 
 
 def refuse_other_sizes(

@@ -21,6 +21,7 @@ from backend.devices.drivers.aravis_library import (
     AravisError,
     AravisMissingError,
     aravis,
+    listed_devices,
     on_control_lost,
 )
 from backend.devices.errors import (
@@ -33,8 +34,10 @@ from backend.devices.errors import (
     IncompleteFrame,
     UnsupportedFeature,
 )
+from backend.devices.found import FoundCamera
+from backend.devices.frame_counting import FrameCounter
 from backend.devices.link import Link
-from backend.devices.options import DeviceOptions, read_options
+from backend.devices.options import DeviceOptions, SerialNumber, read_options
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -53,8 +56,6 @@ _SOCKET_BUFFER_BYTES = 8 << 20
 """Aravis leaves it at the kernel's default, in which a burst of packets doesn't find room."""
 _FEWEST_BUFFERS = 4
 _SUCCESS, _TIMED_OUT = 0, 2  # states of a buffer
-_WRAP = 0xFFFF
-"""GigE Vision counts frames from 1 to 65535."""
 _RANGE_CHECKED = 1
 _ORDINARY_SOCKET = 1
 _HEARTBEAT_S = 3.0
@@ -74,7 +75,7 @@ class AravisOptions(DeviceOptions):
 
     address: str = ""
     """IPv4 address of a GigE Vision camera."""
-    serial: str = ""
+    serial: SerialNumber = ""
     """Serial number of a USB3 Vision camera."""
     packet_bytes: int | None = None
     """Size of stream packets; None: the largest that gets through, found by test packets."""
@@ -91,6 +92,9 @@ class AravisOptions(DeviceOptions):
 def create_camera(name: str, options: Mapping[str, Any]) -> "AravisCamera":
     """Make a camera of a rig file's entry."""
     return AravisCamera(name, read_options(AravisOptions, name, options))
+
+
+create_camera.options_model = AravisOptions  # type: ignore[attr-defined]  # read by driver_loading
 
 
 class AravisCamera(Link):
@@ -112,7 +116,7 @@ class AravisCamera(Link):
         self._buffers = 0
         self._free_at_s = 0.0
         self._due_at_s = 0.0
-        self._counter = _FrameCounter()
+        self._counter = FrameCounter()
 
     # ------------------------------------------------------------ life
 
@@ -510,28 +514,6 @@ class _Handle:
         self.value = 0
 
 
-class _FrameCounter:
-    """Frame numbers that don't wrap."""
-
-    def __init__(self) -> None:
-        self._base = 0
-        self._last = 0
-        self._number = -1
-
-    def restart(self) -> None:
-        """Begin with a new acquisition, which counts from 1 again; ours goes on."""
-        self._last = 0
-
-    def count(self, block_id: int) -> int:
-        """Return the running number of a frame, gaps included."""
-        if block_id == 0 or block_id > _WRAP:  # not GigE Vision's counting: every frame is the next
-            self._number += 1
-            return self._number
-        self._number += (block_id - self._last) % _WRAP or _WRAP
-        self._last = block_id
-        return self._number
-
-
 def _pixels(
     buffer: int, height_px: int, width_px: int, pixel_format: str
 ) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"] | None:
@@ -544,3 +526,25 @@ def _pixels(
         return None
     data = ctypes.string_at(address, count_bytes)
     return np.frombuffer(bytearray(data), dtype).reshape(height_px, width_px)
+
+
+def search() -> tuple[FoundCamera, ...]:
+    """Let Aravis look for cameras on USB and, by broadcast, on every network."""
+    try:
+        listed = listed_devices()
+    except AravisMissingError as error:
+        raise DeviceNotFound("aravis", str(error)) from error
+    return tuple(
+        FoundCamera(
+            "aravis",
+            {"address": one.address} if one.protocol == "GigEVision" else {"serial": one.serial},
+            vendor=one.vendor,
+            model=one.model,
+            serial=one.serial,
+            address=one.address if one.protocol == "GigEVision" else "",
+        )
+        for one in listed
+    )
+
+
+create_camera.search = search  # type: ignore[attr-defined]  # called by discovery

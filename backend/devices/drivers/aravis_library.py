@@ -6,6 +6,7 @@ ctypes needs neither a compiler nor GObject introspection, and runs with any CPy
 import ctypes
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -84,6 +85,13 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_gv_auto_packet_size": (_UINT, (_POINTER,)),
 }  # fmt: skip
 _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "arv_update_device_list": (None, ()),
+    "arv_get_n_devices": (_UINT, ()),
+    "arv_get_device_protocol": (_TEXT, (_UINT,)),
+    "arv_get_device_address": (_TEXT, (_UINT,)),
+    "arv_get_device_vendor": (_TEXT, (_UINT,)),
+    "arv_get_device_model": (_TEXT, (_UINT,)),
+    "arv_get_device_serial_nbr": (_TEXT, (_UINT,)),
     "arv_camera_get_device": (_POINTER, (_POINTER,)),
     "arv_camera_is_gv_device": (_BOOL, (_POINTER,)),
     "arv_camera_set_range_check_policy": (None, (_POINTER, _INT)),
@@ -163,6 +171,37 @@ class Aravis:
         taken = AravisError(domain, int(content.code), message)
         self._library.g_error_free(error)
         return taken
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A device of the library's list."""
+
+    protocol: str
+    """GigEVision or USB3Vision."""
+    address: str
+    vendor: str
+    model: str
+    serial: str
+
+
+def listed_devices() -> tuple[Listed, ...]:
+    """Let the library look for devices. It broadcasts on every network: only on an operator's request."""
+    library = aravis()
+    with library.opening:
+        library.plain("arv_update_device_list")
+        count = int(library.plain("arv_get_n_devices"))
+        return tuple(
+            Listed(
+                *(
+                    (library.plain(f"arv_get_device_{what}", index) or b"").decode(
+                        "utf-8", "replace"
+                    )
+                    for what in ("protocol", "address", "vendor", "model", "serial_nbr")
+                )
+            )
+            for index in range(count)
+        )
 
 
 @lru_cache(maxsize=1)

@@ -1,6 +1,7 @@
 """Libraries that come with an extra of this package and may be missing."""
 
 import importlib
+import warnings
 from typing import Any
 
 from backend.devices.errors import DeviceNotFound
@@ -15,7 +16,10 @@ def imported(device: str, module: str, extra: str) -> Any:
         If it isn't installed; the sentence says how to.
     """
     try:
-        return importlib.import_module(module)
+        with warnings.catch_warnings():
+            # Libraries wrapped by SWIG warn about their own types; where warnings are errors, they crash in C.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return importlib.import_module(module)
     except ImportError as error:
         library = module.partition(".")[0]
         raise DeviceNotFound(

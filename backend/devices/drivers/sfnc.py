@@ -12,6 +12,7 @@ from pydantic import Field
 from backend.devices.errors import FeatureError, UnsupportedFeature
 from backend.devices.options import DeviceOptions
 from backend.devices.protocols import CameraCapabilities, CameraSettings, Range, TriggerSource
+from backend.devices.refusals import fixed_exposure
 
 MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 _COLOUR_CHANNELS = {"RGB8": 3, "BGR8": 3, "RGBa8": 4, "BGRa8": 4}
@@ -199,13 +200,7 @@ class SfncControls:
     def _exposure_range(self) -> Range:
         if self._exposure:
             return Range(*self._features.bounds(self._exposure), "us")
-        fixed_us = self._options.exposure_us
-        if fixed_us is None:
-            raise UnsupportedFeature(
-                self._camera,
-                "has no exposure that could be set; say in the rig file which it has, e.g. `exposure_us: 20000`",
-            )
-        return Range(fixed_us, fixed_us, 0.0, "us")
+        return fixed_exposure(self._camera, self._options.exposure_us)
 
     def _gain_range(self) -> Range:
         if self._gain:
