@@ -4,9 +4,10 @@ Driving a plan again with journalled frames is resume after a crash, undo, parti
 plans are deterministic, so the same frames lead to the same shots.
 """
 
+import logging
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -15,8 +16,9 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from backend.devices.errors import DeviceError
+from backend.devices.errors import DeviceError, OutOfSync
 from backend.devices.protocols import Frame as DeviceFrame
+from backend.domain.checks import Check
 from backend.domain.errors import InvalidCaptureError, RigFailedError, StageFailedError
 from backend.domain.frames import Frame, InMemory, Pixels
 from backend.domain.patterns import Pattern
@@ -25,9 +27,13 @@ from backend.domain.shots import Burst, Exposed, Plan, Shot, Until
 from backend.jobs.control import JobControl
 from backend.jobs.journal import Journal, shot_document, shot_hash
 from backend.jobs.rendering import render
-from backend.jobs.shooting import Shooter
+from backend.jobs.shooting import Shooter, Take
+from backend.jobs.sync_checks import TRIES, SyncWatch
+from backend.jobs.sync_sets import Planned, Unit, Witness
 from backend.storage.artifacts import ArtifactStore, StoredPixels
 from backend.storage.rows import FrameRow
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -59,11 +65,16 @@ class _Asked:
     occurrence: int
 
 
+_Frames = Mapping[str, DeviceFrame]
+"""What one exposure brought, by camera."""
+
+
 @dataclass
 class CaptureSession:
     """Everything that one run of a capturing stage needs to drive its plans.
 
     `run_plan` may be called several times; a shot that is asked for again is a new occurrence, across plans.
+    Where the rig's light isn't certain, frames are verified before they count (`SyncWatch`); `finish` ends that.
     """
 
     scan: str
@@ -80,6 +91,12 @@ class CaptureSession:
     _occurrences: Counter[str] = field(default_factory=Counter, init=False)
     _masks: dict[int, tuple[Pixels, str]] = field(default_factory=dict, init=False)
     _loaded: tuple[str, ...] = field(default=(), init=False)
+    _watch: SyncWatch = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Watch over what is captured, unless its light is certain."""
+        uncertain = self.shooter is not None and not self.shooter.certain
+        self._watch = SyncWatch(f"{self.scan}/{self.stage}/{self.take}", active=uncertain)
 
     def run_plan(self, plan: Plan[T]) -> T:
         """Drive a plan to its end and return what it learnt.
@@ -102,6 +119,36 @@ class CaptureSession:
             return end.value  # type: ignore[no-any-return]  # a generator's return value has no type here
         finally:
             plan.close()
+
+    def finish(self) -> tuple[Check, ...]:
+        """Take the last look at the light, and return what was found of the frames; empty where nothing was captured.
+
+        Raises
+        ------
+        CancelledError
+            If the job is stopped.
+        """
+        white = self._watch.last_white
+        if self.shooter is not None and white is not None:
+            try:
+                self._load([white.shot, *self._shots_of(self._watch.last_black)])
+                if self._watch.judge_drift(self._witness(white)):
+                    black = self._watch.last_black
+                    assert black is not None, "there is one beside each white"
+                    self._watch.judge_drift({}, self._witness(black))
+            except DeviceError as error:
+                # The frames are all there: a witness is no reason to lose them.
+                self.control.check()
+                log.warning("The last look at the light of %s failed: %s", self.stage, error)
+        return self._watch.checks()
+
+    def _shots_of(self, planned: Planned | None) -> list[Shot]:
+        return [] if planned is None else [planned.shot]
+
+    def _witness(self, planned: Planned) -> _Frames:
+        assert self.shooter is not None  # `finish` looked
+        self.control.shots(None, "a last look at the light", None)
+        return self.shooter.take_all([self._take_of(planned)])[0]
 
     def _answer(self, request: Burst | Until) -> tuple[Exposed, ...]:
         if isinstance(request, Until):
@@ -133,20 +180,99 @@ class CaptureSession:
     def _capture(
         self, burst: Burst, missing: Mapping[int, Sequence[_Asked]]
     ) -> dict[int, dict[str, FrameRow]]:
-        """Take the shots that aren't in the journal; one is written while the next are exposed.
+        """Take the shots that aren't in the journal; some are written while the next are exposed.
 
-        Whatever ends this, what was exposed is written first.
+        Whatever ends this, what was exposed and verified is written first.
         """
-        pace = _Pace([burst[i].exposure_ms for i in missing], self.clock)
-        self._load([burst[i] for i in missing])
-        writes: dict[int, Future[dict[str, FrameRow]]] = {}
+        if not missing:
+            return {}
+        cameras = {i: tuple(share.camera for share in shares) for i, shares in missing.items()}
+        units = self._watch.units(burst, cameras)
+        self._load([planned.shot for unit in units for planned in unit.planned])
+        writes: list[Future[dict[int, dict[str, FrameRow]]]] = []
+        most = 1 + (_MOST_UNWRITTEN - 1) // max(len(unit.planned) for unit in units)
         with ThreadPoolExecutor(1, thread_name_prefix="journal") as writer:
-            for n, (i, shares) in enumerate(missing.items()):
-                self._tell(pace, n, len(burst), burst[i], kept=len(burst) - len(missing))
-                if n >= _MOST_UNWRITTEN:
-                    list(writes.values())[n - _MOST_UNWRITTEN].result()
-                writes[i] = writer.submit(self._keep, self._expose(shares))
-        return {i: write.result() for i, write in writes.items()}
+            for unit, frames in self._verified(units, burst, kept=len(burst) - len(missing)):
+                if len(writes) >= most:
+                    writes[-most].result()
+                writes.append(writer.submit(self._keep_unit, unit, frames, missing))
+        return {i: rows for write in writes for i, rows in write.result().items()}
+
+    def _verified(
+        self, units: Sequence[Unit], burst: Burst, *, kept: int
+    ) -> Iterator[tuple[Unit, Sequence[_Frames]]]:
+        """Expose unit after unit; one whose frames aren't right is taken again, a few times."""
+        assert self.shooter is not None  # `_load` refused otherwise
+        planned = [p for unit in units for p in unit.planned]
+        pace = _Pace([p.shot.exposure_ms for p in planned], self.clock)
+        done = 0
+        chunks = self.shooter.chunks([self._take_of(p) for p in planned])
+        waiting: deque[_Frames] = deque()
+        for unit in units:
+            while len(waiting) < len(unit.planned):
+                chunk = next(chunks)
+                self._tell(pace, done, planned, len(burst), kept=kept)
+                waiting.extend(self.shooter.take_all(chunk))
+                done += len(chunk)
+            frames = [waiting.popleft() for _ in unit.planned]
+            yield unit, self._right(unit, frames, burst)
+
+    def _right(self, unit: Unit, frames: Sequence[_Frames], burst: Burst) -> Sequence[_Frames]:
+        """Judge a unit's frames, and take them again if they aren't right.
+
+        Raises
+        ------
+        OutOfSync
+            If they never are.
+        """
+        assert self.shooter is not None  # `_load` refused otherwise
+        for attempt in range(1, TRIES + 1):
+            violation = self._watch.judge(unit, frames, burst)
+            if violation is None:
+                return frames
+            if attempt == TRIES:
+                raise OutOfSync(
+                    violation.camera,
+                    f"{violation.sentence}, {TRIES} times in a row: the display is late, torn or not lit;"
+                    f" {self.shooter.way_out}",
+                )
+            self.control.note(f"{violation.camera}: {violation.sentence}; taken again")
+            log.warning(
+                "%s/%s, camera %s: %s; taken again",
+                self.scan, self.stage, violation.camera, violation.sentence,
+            )  # fmt: skip
+            self._watch.findings.again += 1
+            takes = [self._take_of(planned) for planned in unit.planned]
+            chunks = self.shooter.chunks(takes)
+            frames = [taken for chunk in chunks for taken in self.shooter.take_all(chunk)]
+        raise AssertionError("the last attempt returns or raises")
+
+    def _take_of(self, planned: Planned) -> Take:
+        shot = planned.shot
+        return Take(
+            self._loaded.index(_picture_id(shot.pattern, self._mask_hash(shot.mask))),
+            shot.exposure_ms,
+            shot.gain_db,
+            planned.cameras,
+            steady=planned.witness in (Witness.WHITE, Witness.BLACK),
+        )
+
+    def _keep_unit(
+        self, unit: Unit, frames: Sequence[_Frames], missing: Mapping[int, Sequence[_Asked]]
+    ) -> dict[int, dict[str, FrameRow]]:
+        """Write what the plan asked for of a unit, together."""
+        taken = [
+            (share, exposed[share.camera])
+            for planned, exposed in zip(unit.planned, frames, strict=True)
+            if planned.number is not None
+            for share in missing[planned.number]
+        ]
+        rows = iter(self._keep(taken))
+        return {
+            planned.number: {share.camera: next(rows) for share in missing[planned.number]}
+            for planned in unit.planned
+            if planned.number is not None
+        }
 
     def _ask(self, shot: Shot) -> list[_Asked]:
         mask_hash = self._mask_hash(shot.mask)
@@ -177,12 +303,12 @@ class CaptureSession:
         )
         return [(share, frames[share.camera]) for share in shares]
 
-    def _keep(self, taken: Sequence[tuple[_Asked, DeviceFrame]]) -> dict[str, FrameRow]:
-        """Write a shot's pictures, then their lines in the journal: a crash between the two loses one shot."""
-        rows = {share.camera: self._row(share, frame) for share, frame in taken}
-        self.journal.add(tuple(rows.values()))
-        for share, frame in taken:
-            self.seen(share.camera, frame, rows[share.camera])
+    def _keep(self, taken: Sequence[tuple[_Asked, DeviceFrame]]) -> list[FrameRow]:
+        """Write pictures, then their lines in the journal: a crash between the two loses them, nothing else."""
+        rows = [self._row(share, frame) for share, frame in taken]
+        self.journal.add(tuple(rows))
+        for (share, frame), row in zip(taken, rows, strict=True):
+            self.seen(share.camera, frame, row)
         return rows
 
     def _row(self, share: _Asked, frame: DeviceFrame) -> FrameRow:
@@ -231,7 +357,8 @@ class CaptureSession:
             self.control.shots(None, f"waiting, {request.shot.role or 'picture'} by picture", None)
             taken = self._expose(shares)
             if request.ready({share.camera: _unsaved(share, frame) for share, frame in taken}):
-                return self._keep(taken)
+                rows = self._keep(taken)
+                return {share.camera: row for share, row in zip(shares, rows, strict=True)}
             for share, frame in taken:
                 self.seen(share.camera, frame, None)
             if self.clock() >= deadline:
@@ -277,9 +404,16 @@ class CaptureSession:
 
     # words
 
-    def _tell(self, pace: "_Pace", n: int, size: int, shot: Shot, *, kept: int) -> None:
-        share = (kept + n) / size if size > 1 else None
-        self.control.shots(share, f"{_named(shot)}, {kept + n + 1} of {size}", pace.remaining_s(n))
+    def _tell(
+        self, pace: "_Pace", done: int, planned: Sequence[Planned], size: int, *, kept: int
+    ) -> None:
+        """Tell how far a burst is; what is exposed besides is passed over."""
+        before = kept + sum(p.number is not None for p in planned[:done])
+        following = (p for p in planned[done:] if p.number is not None)
+        shot = next(following, planned[done]).shot
+        share = before / size if size > 1 else None
+        text = f"{_named(shot)}, {min(before + 1, size)} of {size}"
+        self.control.shots(share, text, pace.remaining_s(done))
 
     def _failed(self, error: DeviceError) -> RigFailedError:
         kept = len(self.journal)

@@ -17,6 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 from backend.contract.events import Event, FrameCaptured, JobProgress, ScanChanged
 from backend.devices.protocols import Frame as DeviceFrame
 from backend.devices.protocols import KnowsTruth, Rig
+from backend.domain.checks import Check
 from backend.domain.errors import CancelledError, UnglareError
 from backend.domain.method import Method
 from backend.domain.rig import RigCalibration, RigFacts
@@ -31,6 +32,7 @@ from backend.jobs.live import LivePicture
 from backend.jobs.loading import NO_RIG, LoadedScan, load_inputs, load_scan
 from backend.jobs.plan import Gate, PlannedStage, next_step
 from backend.jobs.rigs import Owner, RigGiven, RigPool
+from backend.jobs.sequence_shooting import shooter_of
 from backend.jobs.shooting import Shooter
 from backend.jobs.stage_work import (
     Outcome,
@@ -238,16 +240,18 @@ class JobExecution:
         stage, params = planned.stage, planned.settings.params
         device: dict[str, Any] = {}
         if scan.row.rig == NO_RIG:
-            result = self._drive(None, planned, scan, task)
+            result, verified = self._drive(None, planned, scan, task)
         else:
             owner = Owner(scan.row.id, scan.title, self._job.who)
             rigs, row = self._shop.rigs, scan.row
             with rigs.lease(row.rig, row.rig_options, owner, self.control) as lease:
-                result, device = lease.call(
+                result, verified, device = lease.call(
                     lambda rig: self._shoot(rig, lease.threads, planned, scan, task)
                 )
         with stage_errors(stage):
-            return replace(conclude(stage, result, params, self._shop.store), device=device)
+            outcome = conclude(stage, result, params, self._shop.store)
+        checks = (*outcome.checks, *(asdict(check) for check in verified))
+        return replace(outcome, checks=checks, device=device)
 
     def _shoot(
         self,
@@ -256,10 +260,10 @@ class JobExecution:
         planned: PlannedStage,
         scan: LoadedScan,
         task: StageTask,
-    ) -> tuple[Any, dict[str, Any]]:
-        with Shooter(rig, self.control, threads) as shooter:
-            result = self._drive(shooter, planned, scan, task)
-        return result, _devices(rig, shooter.waited_s)
+    ) -> tuple[Any, tuple[Check, ...], dict[str, Any]]:
+        with shooter_of(rig, self.control, threads) as shooter:
+            result, verified = self._drive(shooter, planned, scan, task)
+        return result, verified, _devices(rig, shooter.waited_s)
 
     def _drive(
         self,
@@ -267,8 +271,11 @@ class JobExecution:
         planned: PlannedStage,
         scan: LoadedScan,
         task: StageTask,
-    ) -> Any:
-        """Run a capturing stage; without a shooter every frame has to be in the journal."""
+    ) -> tuple[Any, tuple[Check, ...]]:
+        """Run a capturing stage, and return what was found of its frames, too.
+
+        Without a shooter every frame has to be in the journal.
+        """
         stage, shop = planned.stage, self._shop
         facts = decode(scan.given[RigFacts.__name__].document, RigFacts, shop.store)
         session = CaptureSession(
@@ -283,13 +290,14 @@ class JobExecution:
             seen=lambda camera, frame, row: self._seen(scan, camera, frame, row),
         )
         with stage_errors(stage):
-            return stage.run(
+            result = stage.run(
                 decode_inputs(stage, task.inputs, shop.store),
                 planned.settings.params,
                 shoot=session.run_plan,
                 progress=self.control.progress,
                 load=shop.store.get,
             )
+            return result, session.finish()
 
     def _seen(
         self, scan: LoadedScan, camera: str, frame: DeviceFrame, row: FrameRow | None

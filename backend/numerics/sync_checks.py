@@ -210,6 +210,15 @@ def marker_light(
     return max(0.0, above[0] / brightest)
 
 
+def black_light(frame: FrameSample, fields: Fields, exposure: float) -> float | None:
+    """Return which share of white a frame has that should be black; None where the camera doesn't see the projector."""
+    lit = fields.lit
+    white = float(fields.brightness(exposure)[lit].mean()) if lit.any() else 0.0
+    if white < 4 * _LEAST_MODULATION * frame.full_scale_gray:
+        return None
+    return max(0.0, float((frame.gray - fields.darkest(exposure))[lit].mean()) / white)
+
+
 def white_light(marker: FrameSample, fields: Fields, exposure: float) -> float | None:
     """Return which share of white a frame has that should be white; None where the camera doesn't see the projector."""
     lit = fields.lit

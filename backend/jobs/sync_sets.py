@@ -1,0 +1,223 @@
+"""Which shots of a burst verify one another, and where a marker goes that only the software knows of."""
+
+import enum
+import random
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+
+from backend.domain.patterns import (
+    BLACK,
+    WHITE,
+    Gray,
+    Pattern,
+    Sine,
+    StaticPicture,
+    Stripe,
+    Uniform,
+)
+from backend.domain.shots import Shot
+
+FEWEST_STEPS_ALONE = 4
+"""So many phase steps say by themselves whether one is wrong; three need another set to be compared with."""
+_EARLY = 6
+"""The marker is among so many shots at the beginning: until it is seen, nothing is written."""
+_WHITE_FROM = 200.0
+
+
+class SetKind(enum.Enum):
+    """How the frames of a set verify one another."""
+
+    STEPS = "steps"
+    """Phase steps of one fringe: a sinusoid fits them."""
+    PAIR = "pair"
+    """A pattern and its inverse: their sum is the same for all."""
+    SAME = "same"
+    """One pattern several times."""
+    WHITE = "white"
+    """Bright, as the projector's light is known."""
+    BLACK = "black"
+    """Dark."""
+    SINGLE = "single"
+    """Nothing is known of it."""
+
+
+class Witness(enum.Enum):
+    """What is exposed besides what the plan asks for."""
+
+    WHITE = "white"
+    BLACK = "black"
+    MARKER = "marker"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One exposure to be taken."""
+
+    shot: Shot
+    cameras: tuple[str, ...]
+    number: int | None = None
+    """Place in the burst; None for what the plan doesn't ask for."""
+    witness: Witness | None = None
+
+
+@dataclass(frozen=True)
+class FrameSet:
+    """Consecutive shots that verify one another."""
+
+    kind: SetKind
+    numbers: tuple[int, ...]
+    """Their places in the burst."""
+    family: Hashable = None
+    """Sets of one family have light in common; None: they are judged by themselves."""
+
+    @property
+    def needs_partner(self) -> bool:
+        """Whether it takes another set of its family to judge it."""
+        return self.family is not None
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What is written together, once it is verified, and taken again together if it isn't right."""
+
+    planned: tuple[Planned, ...]
+    sets: tuple[FrameSet, ...]
+
+
+def sets_of(burst: Sequence[Shot], cameras: Mapping[int, tuple[str, ...]]) -> list[FrameSet]:
+    """Group the shots to be taken, whose numbers are the keys of `cameras`, into sets."""
+    groups: list[list[int]] = []
+    for number in cameras:
+        group = groups[-1] if groups else []
+        if group and _joins([burst[n] for n in group], burst[number]):
+            same_cameras = cameras[group[-1]] == cameras[number]
+            if same_cameras and group[-1] + 1 == number:
+                group.append(number)
+                continue
+        groups.append([number])
+    return [_set(burst, group, cameras[group[0]]) for group in groups]
+
+
+def units_of(
+    burst: Sequence[Shot],
+    cameras: Mapping[int, tuple[str, ...]],
+    *,
+    seed: str,
+    first: Sequence[Planned] = (),
+) -> list[Unit]:
+    """Cut a burst into units, the first of which holds the marker.
+
+    Parameters
+    ----------
+    burst
+        What the plan asks for.
+    cameras
+        Shots to be taken, by their place in the burst, and the cameras that take them.
+    seed
+        Of the marker's place.
+    first
+        What is exposed before everything else.
+    """
+    sets = sets_of(burst, cameras)
+    place = random.Random(seed).randint(0, min(len(cameras), _EARLY))  # noqa: S311  nobody is to be kept from guessing it
+    units: list[Unit] = []
+    joined: list[FrameSet] = []
+    compared: set[Hashable] = set()
+    for n, one in enumerate(sets):
+        joined.append(one)
+        count = sum(len(s.numbers) for s in joined)
+        if (not units and count < place) or _lacks_partner(joined, sets[n + 1 :], compared):
+            continue
+        units.append(_unit(burst, cameras, joined))
+        compared |= {s.family for s in joined}
+        joined = []
+    if units:
+        units[0] = _marked(units[0], burst, place, tuple(first))
+    return units
+
+
+def _lacks_partner(
+    joined: Sequence[FrameSet], later: Sequence[FrameSet], compared: set[Hashable]
+) -> bool:
+    families = [s.family for s in joined if s.needs_partner and s.family not in compared]
+    alone = {family for family in families if families.count(family) < 2}
+    return any(s.family in alone for s in later)
+
+
+def _unit(
+    burst: Sequence[Shot], cameras: Mapping[int, tuple[str, ...]], sets: Sequence[FrameSet]
+) -> Unit:
+    numbers = [n for one in sets for n in one.numbers]
+    return Unit(tuple(Planned(burst[n], cameras[n], n) for n in numbers), tuple(sets))
+
+
+def _marked(unit: Unit, burst: Sequence[Shot], place: int, first: tuple[Planned, ...]) -> Unit:
+    planned = unit.planned
+    beside = planned[min(place, len(planned) - 1)]
+    dark = all(_is_dark(p.shot.pattern) for p in planned)
+    shot = Shot(
+        WHITE if dark else BLACK,
+        beside.shot.exposure_ms,
+        beside.shot.gain_db,
+        role="marker",
+    )
+    marker = Planned(shot, beside.cameras, witness=Witness.MARKER)
+    return Unit((*first, *planned[:place], marker, *planned[place:]), unit.sets)
+
+
+def _is_dark(pattern: Pattern) -> bool:
+    if isinstance(pattern, Uniform):
+        return pattern.gray < 32
+    return isinstance(pattern, StaticPicture)
+
+
+# ---------------------------------------------------------------- what belongs together
+
+
+def _joins(group: Sequence[Shot], shot: Shot) -> bool:
+    first = group[0]
+    if _light(first) != _light(shot):
+        return False
+    a, b = first.pattern, shot.pattern
+    if isinstance(a, Sine) and isinstance(b, Sine):
+        shifts = {s.pattern.shift_rad for s in group if isinstance(s.pattern, Sine)}
+        return _fringe(a) == _fringe(b) and b.shift_rad not in shifts
+    if isinstance(a, Gray | Stripe) and isinstance(b, Gray | Stripe):
+        return len(group) == 1 and b == a.model_copy(update={"inverse": not a.inverse})
+    return isinstance(a, Uniform) and a == b
+
+
+def _set(burst: Sequence[Shot], numbers: Sequence[int], cameras: tuple[str, ...]) -> FrameSet:
+    first = burst[numbers[0]]
+    pattern, count = first.pattern, len(numbers)
+    light = (*_light(first), cameras)
+    if isinstance(pattern, Sine):
+        family = None
+        if count < FEWEST_STEPS_ALONE:
+            family = ("sine", pattern.low_gray, pattern.high_gray, pattern.codes, light)
+        kind = SetKind.STEPS if count >= FEWEST_STEPS_ALONE - 1 else SetKind.SINGLE
+        return FrameSet(kind, tuple(numbers), family if kind is SetKind.STEPS else None)
+    if isinstance(pattern, Gray | Stripe):
+        if count == 2:
+            return FrameSet(SetKind.PAIR, tuple(numbers), ("pair", light))
+        return FrameSet(SetKind.SINGLE, tuple(numbers))
+    return FrameSet(_uniform_kind(first, count), tuple(numbers))
+
+
+def _uniform_kind(shot: Shot, count: int) -> SetKind:
+    if count > 1:
+        return SetKind.SAME
+    if not isinstance(shot.pattern, Uniform):
+        return SetKind.SINGLE
+    if shot.pattern.gray == 0:
+        return SetKind.BLACK
+    is_white = shot.pattern.gray >= _WHITE_FROM and shot.mask is None
+    return SetKind.WHITE if is_white else SetKind.SINGLE
+
+
+def _light(shot: Shot) -> tuple[Hashable, ...]:
+    return shot.exposure_ms, shot.gain_db, id(shot.mask)
+
+
+def _fringe(sine: Sine) -> tuple[Hashable, ...]:
+    return sine.axis, sine.periods, sine.offset_rad, sine.low_gray, sine.high_gray, sine.codes
