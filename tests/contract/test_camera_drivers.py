@@ -48,6 +48,13 @@ def cameras_of(driver: str, options: dict[str, dict[str, object]]) -> dict[str, 
     return {name: make_camera(name, driver, given) for name, given in options.items()}
 
 
+@contextmanager
+def opened(name: str, driver: str, options: Mapping[str, object]) -> Iterator[Camera]:
+    camera = make_camera(name, driver, options)
+    with camera:
+        yield camera
+
+
 # ---------------------------------------------------------------- pylon
 
 EMULATED = {
@@ -121,7 +128,7 @@ def test_an_emulated_camera_takes_the_pictures_of_a_folder(tmp_path):
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(tmp_path / f"{number}.png"), picture)
     options = {"serial": "0815-0000", "emulated": True, "pictures": str(tmp_path)}
-    with make_camera("left", "pylon", options) as camera:
+    with opened("left", "pylon", options) as camera:
         assert camera.capabilities.sensor_size == (64, 48)
         camera.arm()
         for expected in (*pictures, pictures[0]):
@@ -198,7 +205,7 @@ def test_a_gentl_camera_is_found_by_serial_number_or_not_at_all():
 
 def test_a_gentl_camera_that_is_in_use_is_refused_and_the_other_goes_on():
     options = {"producer": str(viky()), "serial": "0", "exposure_us": 50_000}
-    with make_camera("left", "gentl", options) as camera:
+    with opened("left", "gentl", options) as camera:
         camera.arm()
         with pytest.raises(DeviceBusy, match="right: another program controls"):
             make_camera("right", "gentl", options).open()
@@ -223,7 +230,7 @@ def test_a_producer_that_is_not_one_is_one_sentence(tmp_path, content):
 def test_a_camera_that_was_given_back_can_be_opened_by_another():
     options = {"producer": str(viky()), "serial": "0", "exposure_us": 50_000}
     for name in ("left", "right"):
-        with make_camera(name, "gentl", options) as camera:
+        with opened(name, "gentl", options) as camera:
             camera.arm()
             camera.get_frame()
     assert not gentl_camera._producers
@@ -404,7 +411,7 @@ def test_files_are_played_in_order_and_again(tmp_path, write):
     if write is write_pictures:
         place.mkdir()
     options = {"source": write(place if place.is_dir() else place.with_suffix(".avi"), 5), "exposure_us": 1}  # fmt: skip
-    with make_camera("left", "video", options) as camera:
+    with opened("left", "video", options) as camera:
         camera.arm()
         values = [int(camera.get_frame().data[0, 0]) for _ in range(8)]
     assert values == [0, 1, 2, 3, 4, 0, 1, 2]
