@@ -64,6 +64,8 @@ class PatternSet(_Entry):
     """Files of the packed images, in the order of the projector's memory."""
     left_out: tuple[str, ...] = ()
     """What a scan shows besides and no file can hold, and why; one sentence each."""
+    files: tuple[str, ...] = ()
+    """Everything that was written beside the list."""
 
     @classmethod
     def read(cls, folder: Path) -> "PatternSet":
@@ -155,6 +157,7 @@ def write_set(
     )
     groups = [pictures[i : i + each] for i in range(0, len(pictures), each)] if pack else []
     height_px, width_px = pictures[0].shape
+    images = tuple(f"flash_{number:02d}.bmp" for number in range(len(groups)))
     written = PatternSet(
         method=method,
         width_px=width_px,
@@ -162,8 +165,9 @@ def write_set(
         gamma=gamma,
         bit_depth=depth,
         patterns=entries,
-        images=tuple(f"flash_{number:02d}.bmp" for number in range(len(groups))),
+        images=images,
         left_out=tuple(left_out),
+        files=(*(entry.file for entry in entries), *images),
     )
     folder.mkdir(parents=True, exist_ok=True)
     for entry, picture in zip(entries, pictures, strict=True):
