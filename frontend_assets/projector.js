@@ -12,6 +12,8 @@ let awaited = null; // the slot that the next binary message fills
 let socket = null;
 let delay = 100;
 let lock = null;
+let period = null; // of the screen's refresh, in [ms]; null: not measured yet
+let measuring = 0;
 
 function geometry() {
   return {
@@ -22,6 +24,7 @@ function geometry() {
     visible: document.visibilityState === "visible",
     screen_x: screenX,
     screen_y: screenY,
+    refresh_period_ms: period,
     screen: `${screen.width}x${screen.height}${screen.isExtended ? " of several" : ""}`,
   };
 }
@@ -33,6 +36,25 @@ function send(message) {
 function tellGeometry() {
   if (!device.width) return; // not measured yet
   send({ t: "geometry", ...geometry() });
+}
+
+// The screen's refresh period over so many animation frames; what skips one or comes late doesn't count.
+function measureRefresh() {
+  const times = [];
+  const run = ++measuring; // a later one takes over
+  const note = (now) => {
+    if (run !== measuring || document.visibilityState !== "visible") return;
+    times.push(now);
+    if (times.length <= 90) return requestAnimationFrame(note);
+    const gaps = times.slice(1).map((time, i) => time - times[i]).sort((a, b) => a - b);
+    const median = gaps[gaps.length >> 1];
+    const regular = gaps.filter((gap) => Math.abs(gap - median) < 0.2 * median);
+    const mean = regular.reduce((sum, gap) => sum + gap, 0) / regular.length;
+    if (!(mean > 0)) return;
+    period = mean;
+    tellGeometry();
+  };
+  requestAnimationFrame(note);
 }
 
 function layOut() {
@@ -151,7 +173,9 @@ addEventListener("wheel", (event) => { if (event.ctrlKey) event.preventDefault()
 addEventListener("contextmenu", (event) => event.preventDefault());
 document.addEventListener("visibilitychange", () => {
   tellGeometry();
-  if (document.visibilityState === "visible") stayAwake();
+  if (document.visibilityState !== "visible") return;
+  stayAwake();
+  measureRefresh();
 });
 // A window that is moved to another screen gets no event of its own.
 let place = "";
@@ -160,6 +184,7 @@ setInterval(() => {
   if (here !== place) {
     place = here;
     tellGeometry();
+    measureRefresh(); // another screen may have another rate
   }
 }, 250);
 

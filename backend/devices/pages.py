@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 SECOND_PAGE = 4009
 """Close code of a page that came second."""
+_USUAL_RATES_HZ = (23.976, 24.0, 25.0, 29.97, 30.0, 48.0, 50.0, 59.94, 60.0, 72.0, 75.0, 85.0, 90.0, 100.0, 119.88, 120.0, 144.0, 165.0, 240.0)  # fmt: skip
 NOT_OURS = 4008
 """Close code of a page that says what no page of ours says."""
 
@@ -44,11 +45,27 @@ class Geometry(BaseModel):
     """Where the window stands, in CSS pixels: another place is another screen."""
     screen: str = ""
     """What the browser tells of the screen."""
+    refresh_period_ms: float | None = Field(None, gt=0)
+    """Of the screen, as the page sees its animation frames; None: not measured yet."""
 
     @property
     def place(self) -> tuple[float, float, str]:
         """What changes when the window goes to another screen."""
         return self.screen_x, self.screen_y, self.screen
+
+
+def usual_rate_hz(measured_hz: float) -> float:
+    """Return the usual refresh rate that a measured one is, else the measured one to 0.01 Hz.
+
+    Measured twice, a rate differs in its last digits; what is kept for a rig must not.
+
+    Examples
+    --------
+    >>> usual_rate_hz(59.9401), usual_rate_hz(59.98), usual_rate_hz(47.1234)
+    (59.94, 60.0, 47.12)
+    """
+    nearest = min(_USUAL_RATES_HZ, key=lambda rate: abs(rate - measured_hz))
+    return nearest if abs(nearest / measured_hz - 1) < 5e-4 else round(measured_hz, 2)
 
 
 @runtime_checkable
@@ -121,6 +138,16 @@ class Page:
         with self._changed:
             self._changed.wait_for(lambda: self._geometry or self._gone, timeout_s)
             return self._geometry
+
+    def wait_for_refresh(self, timeout_s: float) -> float | None:
+        """Wait until the page has measured its screen's refresh rate, in [Hz]; None if it hasn't."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._refresh_hz() or self._gone, timeout_s)
+            return self._refresh_hz()
+
+    def _refresh_hz(self) -> float | None:
+        period_ms = self._geometry.refresh_period_ms if self._geometry else None
+        return None if period_ms is None else usual_rate_hz(1000.0 / period_ms)
 
     def wait_for_reply(self, request_id: int, timeout_s: float) -> Reply | None:
         """Wait for the answer to a request; None if none came, or the page is gone."""

@@ -40,6 +40,9 @@ class KnownLatency(DisplayMode):
     """What is read of the file beside a rig's file."""
 
     settle_ms: float
+    exposure_ms: float | None = None
+    screen: str = ""
+    """Which screen it was measured on; empty: not known."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,14 @@ class KeptRig:
 
     name: str
     path: Path
+
+
+def _same_mode(known: KnownLatency, said: Mapping[str, object], *, measures_itself: bool) -> bool:
+    """Tell whether a projector's entry says the mode that a latency was measured in; a page looks at its rate itself."""
+    now = DisplayMode.model_validate(said)
+    if measures_itself and said.get("refresh_hz") is None:
+        return known.size == now.size
+    return known.mode == now.mode
 
 
 class RigShelf:
@@ -93,12 +104,16 @@ class RigShelf:
             text = self._latency_path(name).read_text("utf-8")
             known = KnownLatency.model_validate_json(text)
             said = dict(file.projector.model_extra or {})
-            same = known.mode == DisplayMode.model_validate(said).mode
+            same = _same_mode(known, said, measures_itself=file.projector.driver == "page")
         except (OSError, ValueError):
             return file
         if not same or "settle_ms" in said:
             return file
-        projector = file.projector.model_copy(update={"settle_ms": known.settle_ms})
+        told: dict[str, object] = {"settle_ms": known.settle_ms}
+        if file.projector.driver == "page":
+            # The page finds out whether it is on the same screen still.
+            told = {"measured": known.model_dump(exclude={"size"})}
+        projector = file.projector.model_copy(update=told)
         return file.model_copy(update={"projector": projector})
 
     def _latency_path(self, name: str) -> Path:

@@ -25,6 +25,8 @@ _SURE = 2e-3
 """What chance may add to the square of a share."""
 _HARMONICS = (2, 3)
 """What a bent response adds to a sinusoid; it isn't the display that is late then."""
+_DRIFT_SIGMA = 0.003
+"""Standard deviation up to which a drift counts as known."""
 _REPEATED = 0.25
 """Two frames that differ by less than this share of what they should show the same."""
 
@@ -157,8 +159,11 @@ class Fields:
 
     @property
     def lit(self) -> Valid:
-        """Pixels that tell white from black clearly."""
-        light = self.white.gray - self.black.gray
+        """Pixels that tell white from black clearly.
+
+        By what their neighbours tell: a pixel that were chosen for its own noise would be darker the next time.
+        """
+        light = (self.white.gray - self.black.gray)[:, ::-1]
         top = float(np.quantile(light, 0.99))
         least = max(0.25 * top, 4 * _LEAST_MODULATION * self.white.full_scale_gray)
         return np.asarray(light > least)
@@ -225,19 +230,22 @@ def white_light(marker: FrameSample, fields: Fields, exposure: float) -> float |
     if int(np.count_nonzero(lit)) < _LEAST_PIXELS:
         return None
     white = float(fields.brightness(exposure)[lit].mean())
-    dark = np.minimum(fields.darkest(exposure), fields.black.gray)
+    dark = fields.black.gray * np.float32(min(1.0, exposure / fields.exposure))
     if white < _LEAST_MODULATION * marker.full_scale_gray:
         return None
     return float((marker.gray - dark)[lit].mean()) / white
 
 
 def drift(before: FrameSample, after: FrameSample, fields: Fields) -> float | None:
-    """Return how much brighter a field has become, as a share of the projector's light; None where it isn't seen."""
+    """Return how much brighter a field has become, as a share of the projector's light; None where noise hides it."""
     use = fields.lit & before.valid & after.valid
     if int(np.count_nonzero(use)) < _LEAST_PIXELS:
         return None
     light = float((fields.white.gray - fields.black.gray)[use].mean())
-    return float((after.gray - before.gray)[use].mean()) / light
+    change = (after.gray - before.gray)[use]
+    if float(change.std()) / np.sqrt(change.size) > _DRIFT_SIGMA * light:
+        return None
+    return float(change.mean()) / light
 
 
 # ---------------------------------------------------------------- covariances of neighbours

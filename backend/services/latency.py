@@ -128,6 +128,8 @@ class Latency:
     """The same from white to black."""
     measured: str
     """When, in UTC."""
+    screen: str = ""
+    """Which screen; empty where the projector doesn't know."""
 
     def keep(self, folder: Path, rig: str) -> Path:
         """Write it where the rig's file is."""
@@ -305,6 +307,7 @@ class _Bench:
             up=_smallest(up, longest.size),
             down=_smallest(down, longest.size),
             measured=datetime.now(UTC).isoformat(timespec="seconds"),
+            screen=str(getattr(self._projector, "screen", "")),
         )
 
 

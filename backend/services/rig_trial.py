@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from backend.devices.errors import DeviceError
-from backend.devices.protocols import Camera, DeviceInfo, Frame, Rig
+from backend.devices.protocols import Camera, DeviceInfo, Frame, Remarks, Rig
 from backend.domain.patterns import BLACK, WHITE
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.jobs.control import JobControl
@@ -92,8 +92,15 @@ def _try(name: str, rig: Rig) -> RigTrial:
         devices=devices,
         frames=frames,
         calibration=_calibration_words(calibration),
-        problems=tuple(_problems(facts, calibration, frames)),
+        problems=(*_remarks(rig), *_problems(facts, calibration, frames)),
     )
+
+
+def _remarks(rig: Rig) -> Iterator[str]:
+    """Return what the devices found doubtful when they were opened."""
+    for device in (rig.projector, *rig.cameras.values()):
+        if isinstance(device, Remarks):
+            yield from device.remarks
 
 
 def _devices(rig: Rig) -> Iterator[TriedDevice]:

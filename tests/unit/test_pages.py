@@ -18,7 +18,7 @@ from backend.devices.options import read_options
 from backend.devices.pages import NOT_OURS, Page, PageDesk
 from backend.devices.protocols import LinkState
 
-GEOMETRY = {"width_px": 64, "height_px": 48, "ratio": 1.0}
+GEOMETRY = {"width_px": 64, "height_px": 48, "ratio": 1.0, "refresh_period_ms": 16.667}
 
 
 class Browser:

@@ -7,7 +7,7 @@ electronics add is measured by the latency calibration and waited for here, in `
 import math
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,21 @@ from backend.devices.refusals import refuse_level, refuse_other_sizes, refuse_un
 
 _JOIN_S = 5.0
 _GEOMETRY_S = 2.0
+_REFRESH_S = 4.0
+"""A page counts 90 frames."""
+_ASSUMED_REFRESH_HZ = 60.0
+_ALIKE = 0.01
+"""Rates that differ by less are the same."""
+
+
+class MeasuredLatency(DeviceOptions):
+    """What the latency calibration found, and where."""
+
+    settle_ms: float = Field(ge=0, le=10_000)
+    exposure_ms: float | None = None
+    refresh_hz: float | None = None
+    screen: str = ""
+    """Empty: not known."""
 
 
 class PageOptions(DeviceOptions):
@@ -39,9 +54,12 @@ class PageOptions(DeviceOptions):
     """Width and height of the projector in [px]: what the page shows is never scaled."""
     page: str = "projector"
     """Name in the page's address."""
-    refresh_hz: float | None = Field(60.0, gt=0)
+    refresh_hz: float | None = Field(None, gt=0)
+    """None: as the page measures it."""
     settle_ms: float | None = Field(None, ge=0, le=10_000)
-    """From the acknowledgement to the light, as the latency calibration found it; None: not measured yet."""
+    """From the acknowledgement to the light; None: as the latency calibration found it, if it was measured."""
+    measured: MeasuredLatency | None = None
+    """What the latency calibration found, kept beside the rig's file; holds for the screen it was measured on."""
 
 
 def create_projector(name: str, options: Mapping[str, Any], desk: PageDesk) -> "PageProjector":
@@ -65,12 +83,32 @@ class PageProjector(Link):
         self._place: tuple[float, float, str] | None = None
         self._patterns: list[UInt8[np.ndarray, "h w"]] = []
         self._stop = threading.Event()
+        self._join_s = _JOIN_S
+        self._refresh_hz = options.refresh_hz or _ASSUMED_REFRESH_HZ
+        self._remarks: tuple[str, ...] = ()
         self.settle_ms = options.settle_ms
+        self.settle_exposure_ms: float | None = None
+        if options.settle_ms is None and options.measured is not None:
+            self._let_settle(options.measured)
 
     @property
     def capabilities(self) -> ProjectorCapabilities:
         """What it can do."""
-        return ProjectorCapabilities(size=self._options.size, refresh_hz=self._options.refresh_hz)
+        return ProjectorCapabilities(size=self._options.size, refresh_hz=self._refresh_hz)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What is doubtful about page and screen; empty: nothing."""
+        return self._remarks
+
+    @property
+    def screen(self) -> str:
+        """What changes when the window goes to another screen; empty before `open`."""
+        return (
+            ""
+            if self._place is None
+            else f"{self._place[2]} at {self._place[0]:g},{self._place[1]:g}"
+        )
 
     def open(self) -> None:
         """Take the page that is open at the projector's address."""
@@ -91,7 +129,7 @@ class PageProjector(Link):
             raise
 
     def _take_page(self) -> None:
-        page = self._desk.find(self._options.page, _JOIN_S)
+        page = self._desk.find(self._options.page, self._join_s)
         if page is None:
             raise DeviceNotFound(
                 self.name,
@@ -106,7 +144,42 @@ class PageProjector(Link):
         self._refuse_scaled(geometry)
         self._page, self._place = page, geometry.place
         self._state = LinkState.READY
+        self._remarks = (*self._look_at_refresh(page), *self._look_at_latency())
         self._send_patterns()
+
+    def _look_at_refresh(self, page: Page) -> Iterator[str]:
+        """Take the screen's rate as the page measured it, unless the rig's file says one."""
+        said_hz = self._options.refresh_hz
+        found_hz = page.wait_for_refresh(_REFRESH_S if said_hz is None else 0.0)
+        self._refresh_hz = said_hz or found_hz or _ASSUMED_REFRESH_HZ
+        if found_hz is None and said_hz is None:
+            yield (
+                f"The projector page couldn't measure its screen's refresh rate, {_ASSUMED_REFRESH_HZ:g} Hz is assumed:"
+                " reload it on the projector's monitor, or give refresh_hz in the rig's file."
+            )
+        elif found_hz is not None and abs(found_hz / self._refresh_hz - 1) > _ALIKE:
+            yield (
+                f"The projector page draws {found_hz:g} times a second, the rig's file says {said_hz:g} Hz: correct"
+                " refresh_hz or leave it out, or exposures don't fit the screen's frames."
+            )
+
+    def _look_at_latency(self) -> Iterator[str]:
+        """Use the measured latency on the screen and in the mode that it was measured in, and nowhere else."""
+        known = self._options.measured
+        if self._options.settle_ms is not None or known is None:
+            return
+        self.settle_ms = self.settle_exposure_ms = None
+        if known.screen and known.screen != self.screen:
+            what = f"on another screen ({known.screen}, now {self.screen})"
+        elif known.refresh_hz and abs(known.refresh_hz / self._refresh_hz - 1) > _ALIKE:
+            what = f"at {known.refresh_hz:g} Hz, now the screen has {self._refresh_hz:g} Hz"
+        else:
+            self._let_settle(known)
+            return
+        yield f"The projector's latency was measured {what}: measure it again (`unglare rigs latency`)."
+
+    def _let_settle(self, known: MeasuredLatency) -> None:
+        self.settle_ms, self.settle_exposure_ms = known.settle_ms, known.exposure_ms
 
     def close(self) -> None:
         """Let the page go; it stays open."""
@@ -120,6 +193,7 @@ class PageProjector(Link):
         deadline_s = time.monotonic() + timeout_s
         while True:
             self.close()
+            self._join_s = min(_JOIN_S, max(0.0, deadline_s - time.monotonic()))
             try:
                 self.open()
                 return
@@ -128,6 +202,8 @@ class PageProjector(Link):
                     raise self._lose_page(
                         f"the projector page didn't come back within {timeout_s:g} s"
                     ) from error
+            finally:
+                self._join_s = _JOIN_S
 
     def load(self, patterns: Sequence[UInt8[np.ndarray, "h w"]]) -> None:
         """Send patterns to the page, so that showing them needs no network."""
