@@ -27,7 +27,17 @@ from backend.contract.requests import (
     StartRun,
     UndoEdit,
 )
-from backend.contract.rigs import RigOffer, RigView
+from backend.contract.rigs import (
+    DiscoverCameras,
+    Discovery,
+    LatencyView,
+    LiveSettings,
+    LiveView,
+    RigOffer,
+    RigState,
+    RigView,
+    StartLatency,
+)
 from backend.contract.scans import (
     ArtifactRef,
     AuditEntry,
@@ -43,6 +53,10 @@ T = TypeVar("T")
 _METHODS = TypeAdapter(MethodList)
 _RIGS: TypeAdapter[tuple[RigOffer, ...]] = TypeAdapter(tuple[RigOffer, ...])
 _RIG = TypeAdapter(RigView)
+_RIG_STATE = TypeAdapter(RigState)
+_LIVE = TypeAdapter(LiveView)
+_LATENCY: TypeAdapter[LatencyView | None] = TypeAdapter(LatencyView | None)
+_DISCOVERY = TypeAdapter(Discovery)
 _SCANS: TypeAdapter[tuple[ScanSummary, ...]] = TypeAdapter(tuple[ScanSummary, ...])
 _SCAN = TypeAdapter(ScanState)
 _AUDIT: TypeAdapter[tuple[AuditEntry, ...]] = TypeAdapter(tuple[AuditEntry, ...])
@@ -148,12 +162,73 @@ class ApiClient:
         """Describe the rig of a scan."""
         return self._get(f"/api/scans/{quote(scan_id)}/rig", _RIG)
 
-    def camera_picture(self, rig: str, camera: str) -> bytes | None:
-        """Return the newest picture of a camera as JPEG, None if there is none."""
-        answer = self._http.get(f"/api/rigs/{quote(rig)}/cameras/{quote(camera)}/preview")
-        if answer.status_code in (204, 404):
-            return None
-        return _checked(answer).content
+    def camera_picture(
+        self, rig: str, camera: str, *, max_px: int = 960, marks: bool = False
+    ) -> bytes | None:
+        """Return the newest picture of a camera as JPEG, None if there is none; `marks` colour what is too bright or dark."""
+        query = {"max_px": max_px, "marks": marks}
+        return self._picture(f"/api/rigs/{quote(rig)}/cameras/{quote(camera)}/preview", query)
+
+    def camera_part(
+        self, rig: str, camera: str, x: int, y: int, *, size_px: int, marks: bool
+    ) -> bytes | None:
+        """Return a square part of the newest picture of a camera, pixel by pixel; None if there is none."""
+        query = {"x": x, "y": y, "part_px": size_px, "marks": marks}
+        return self._picture(f"/api/rigs/{quote(rig)}/cameras/{quote(camera)}/preview", query)
+
+    # ---- a rig without a scan
+
+    def rig_state(self, rig: str) -> RigState:
+        """Tell how a rig is doing."""
+        return self._get(f"/api/rigs/{quote(rig)}/state", _RIG_STATE)
+
+    def connect(self, rig: str, options: dict[str, Any]) -> RigState:
+        """Have a rig opened; the state tells when it is."""
+        return self._send("POST", f"/api/rigs/{quote(rig)}/connect", options, _RIG_STATE)
+
+    def disconnect(self, rig: str) -> RigState:
+        """Have its devices closed."""
+        return self._send("POST", f"/api/rigs/{quote(rig)}/disconnect", None, _RIG_STATE)
+
+    def reconnect(self, rig: str) -> RigState:
+        """Have it closed and opened again."""
+        return self._send("POST", f"/api/rigs/{quote(rig)}/reconnect", None, _RIG_STATE)
+
+    def live(self, rig: str) -> LiveView:
+        """Tell what the newest pictures of a rig say."""
+        return self._get(f"/api/rigs/{quote(rig)}/live", _LIVE)
+
+    def watch(self, rig: str) -> LiveView:
+        """Have live pictures taken for the next seconds; tell what the newest ones say."""
+        return self._send("POST", f"/api/rigs/{quote(rig)}/live", None, _LIVE)
+
+    def set_live(self, rig: str, settings: LiveSettings) -> LiveView:
+        """Set how live pictures are taken; the answer has the settings in force."""
+        return self._send("PUT", f"/api/rigs/{quote(rig)}/live", settings, _LIVE)
+
+    def end_live(self, rig: str) -> LiveView:
+        """End live pictures now."""
+        return self._send("DELETE", f"/api/rigs/{quote(rig)}/live", None, _LIVE)
+
+    def try_rig(self, rig: str) -> RigState:
+        """Begin a trial of a rig."""
+        return self._send("POST", f"/api/rigs/{quote(rig)}/trial", None, _RIG_STATE)
+
+    def start_latency(self, rig: str, request: StartLatency) -> RigState:
+        """Begin to measure the latency of a rig's projector."""
+        return self._send("POST", f"/api/rigs/{quote(rig)}/latency", request, _RIG_STATE)
+
+    def latency(self, rig: str) -> LatencyView | None:
+        """Return the latency measured last or kept for a rig."""
+        return self._get(f"/api/rigs/{quote(rig)}/latency", _LATENCY)
+
+    def cancel_work(self, rig: str) -> RigState:
+        """Have the trial or latency calibration ended that runs."""
+        return self._send("DELETE", f"/api/rigs/{quote(rig)}/work", None, _RIG_STATE)
+
+    def discover(self, request: DiscoverCameras) -> Discovery:
+        """Ask addresses for cameras, or search."""
+        return self._send("POST", "/api/rigs/discover", request, _DISCOVERY)
 
     # ---- scans
 
@@ -287,6 +362,10 @@ class ApiClient:
             stop.wait(_RETRY_S)
 
     # ---- plumbing
+
+    def _picture(self, path: str, query: dict[str, Any]) -> bytes | None:
+        answer = self._http.get(path, params=query)
+        return None if answer.status_code in (204, 404) else _checked(answer).content
 
     def _get(self, path: str, kind: TypeAdapter[T], query: dict[str, Any] | None = None) -> T:
         return kind.validate_json(_checked(self._http.get(path, params=query)).content)

@@ -90,6 +90,9 @@ class Desk(Protocol):
     def show_rig(self) -> None:
         """Show the rig that is chosen on the start page."""
 
+    def open_rig(self, rig: str, options: dict[str, Any] | None) -> None:
+        """Show a rig without a scan; None: with the options that the start page has for it."""
+
     def create(self, request: CreateScan, *, run: bool) -> None:
         """Make a scan, open it, and run it if asked to."""
 

@@ -29,6 +29,7 @@ from app.panels.new_scan import NewScanPanel
 from app.panels.pictures import Choice, PicturesPanel, is_live
 from app.panels.review import ReviewPanel
 from app.panels.rig import RigPanel
+from app.panels.rig_desk import RigDeskPanel
 from app.panels.scan_list import ScanListPanel
 from app.panels.settings import SettingsPanel
 from app.panels.stage import StagePanel
@@ -89,6 +90,7 @@ class Session:
         self._showing_by_itself = False
         self._left_by_hand = ""
         """Scan whose enlarged picture the operator closed: it doesn't come back by itself."""
+        self._rig_desk: RigDeskPanel | None = None
         self._stopping = threading.Event()
         self._acts = Worker(f"acts {client.client_id}", self._report)
         self._loads = Worker(f"loads {client.client_id}", self._report)
@@ -104,6 +106,8 @@ class Session:
         self._acts.close()
         self._loads.close()
         self._rigs.close()
+        if self._rig_desk is not None:
+            self._rig_desk.end()
         self.api.close()
 
     # ---- what panels ask for (see app/desk.py)
@@ -219,6 +223,10 @@ class Session:
         """Show the rig that is chosen on the start page."""
         self._rigs.submit(self._show_rig, key="rig")
 
+    def open_rig(self, rig: str, options: dict[str, Any] | None) -> None:
+        """Show a rig without a scan."""
+        self.act(lambda: self._open_rig(rig, options))
+
     def inspect(self, camera: str) -> None:
         """Show a camera's picture large."""
         self.load(lambda: self._inspect(camera), key="inspect")
@@ -240,16 +248,23 @@ class Session:
         gui.main_panel.set_width(440 if wide else 384)
         self._home = gui.add_folder(None, order=1, visible=False)
         self._scan = gui.add_folder(None, order=2, visible=False)
+        self._rig_controls = gui.add_folder(None, order=3, visible=False)
         self._list_panel = gui.add_panel()
         self._list_panel.dock_left()
         self._list_panel.set_width(400 if wide else 300)
         with self._list_panel.add_tab("Scans", viser.Icon.LIST_DETAILS):
             self._scans = ScanListPanel(gui, self)
         self._build_scan_panels(wide=wide)
+        self._rig_panel = gui.add_panel(visible=False)
+        self._rig_panel.dock_left()
+        self._rig_panel.set_width(400 if wide else 300)
         self._space = Space(client)
         self._rig = RigPanel(self._space, self)
         self._cloud = CloudPanel(client, self._space, self, budget=self._points_budget)
         self._inspector = Inspector(client, self._space, self)
+        self._rig_desk = RigDeskPanel(
+            client, self._space, self, main=self._rig_controls, left=self._rig_panel
+        )
         self._new_scan: NewScanPanel | None = None
         with self._home:
             if self.who.may_operate:
@@ -292,6 +307,7 @@ class Session:
             ("Close the enlarged picture", "X", None, self.leave_inspection),
             ("Follow the running stage", "G", None, lambda: self.select(None)),
             ("All scans", "H", None, self.go_home),
+            ("Rig without a scan: live pictures, light, focus", "L", None, self._show_present_rig),
         ]
         for label, key, modifier, work in keys:
             command = self._gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # keys as viser lists them
@@ -309,6 +325,7 @@ class Session:
         self._look = None
         if self.who.may_operate is False and self._follow_newest():
             return
+        self._close_rig()
         with self._client.atomic():
             self._scan.visible = self._scan_panel.visible = False
             self._home.visible = self._list_panel.visible = True
@@ -333,6 +350,7 @@ class Session:
     def _open(self, scan: ScanState) -> None:
         is_other = self._look is None or self._look.scan.id != scan.id
         method = self._methods.get(scan.method)
+        self._close_rig()
         if is_other:
             self.load(self._clear_scene)
         self._look = Look(scan, method, may_operate=self.who.may_operate)
@@ -340,6 +358,31 @@ class Session:
         with self._client.atomic():
             self._home.visible = self._list_panel.visible = False
             self._scan.visible = self._scan_panel.visible = True
+
+    def _open_rig(self, rig: str, options: dict[str, Any] | None) -> None:
+        desk = self._rig_desk
+        if desk is None:
+            return
+        if options is None:
+            options = self._new_scan.options_of(rig) if self._new_scan is not None else {}
+        self._look = None
+        with self._client.atomic():
+            self._home.visible = self._list_panel.visible = False
+            self._scan.visible = self._scan_panel.visible = False
+        self._clear_scene()
+        desk.open(rig, self.api.rigs(), options)
+
+    def _close_rig(self) -> None:
+        if self._rig_desk is not None and self._rig_desk.rig is not None:
+            self._rig_desk.close()
+
+    def _show_present_rig(self) -> None:
+        """Show the rig of the scan on the screen, or the one that is chosen on the start page."""
+        look, chosen = self._look, self._new_scan.chosen_rig() if self._new_scan else None
+        if look is not None and look.scan.rig:
+            self.open_rig(look.scan.rig, dict(look.scan.rig_options))
+        elif look is None and chosen is not None:
+            self.open_rig(*chosen)
 
     def _patiently(self, words: str, work: Work) -> None:
         """Do what may take long, with a note that says so."""
@@ -580,7 +623,8 @@ class Session:
 
     def _show_rig(self) -> None:
         chosen = self._new_scan.chosen_rig() if self._new_scan is not None else None
-        if self._look is not None or chosen is None:
+        is_elsewhere = self._look is not None or self._is_at_rig()
+        if is_elsewhere or chosen is None:
             return
         name, options = chosen
         with contextlib.suppress(
@@ -589,8 +633,11 @@ class Session:
             rig = self.api.rig(name, options)
             self.load(lambda: self._draw_rig(rig), key="rig")
 
+    def _is_at_rig(self) -> bool:
+        return self._rig_desk is not None and self._rig_desk.rig is not None
+
     def _draw_rig(self, rig: RigView) -> None:
-        if self._look is None:
+        if self._look is None and not self._is_at_rig():
             self._rig.show(rig, "")
 
     def _inspect(self, camera: str) -> None:
@@ -633,6 +680,9 @@ class Session:
 
     def _clicked(self, origin: Any, direction: Any) -> None:
         look = self._look
+        if self._rig_desk is not None and self._rig_desk.rig is not None:
+            self._rig_desk.click(origin, direction)
+            return
         if look is None:
             return
         if self._inspector.is_open:
@@ -670,6 +720,13 @@ class Session:
                     lambda: self._show_live(event.rig, event.camera), key=f"live {event.camera}"
                 )
         elif isinstance(event, RigChanged) and look is None:
+            self._rig_changed(event.rig)
+
+    def _rig_changed(self, rig: str) -> None:
+        desk = self._rig_desk
+        if desk is not None and self._is_at_rig():
+            desk.changed(rig)
+        else:
             self.show_rig()
 
     def _scan_changed(self, scan_id: str | None) -> None:

@@ -32,6 +32,7 @@ div:has(> i.ug-wrong) + div .mantine-Input-input { border-color: #e25555 !import
 div:has(> i.ug-primary) + div button { height: 38px !important; font-size: 15px; font-weight: 600; }
 div:has(> i.ug-row3) + div, div:has(> i.ug-row3) + div + div, div:has(> i.ug-row3) + div + div + div { display: inline-block; width: calc((100% - 36px) / 3); margin-inline: 10px 0 !important; }
 div:has(> i.ug-row3) + div + div, div:has(> i.ug-row3) + div + div + div { margin-left: 8px !important; }
+div:has(> i.ug-boxes) + div > div > div:has(> p > label[for]), div:has(> i.ug-boxes) + div + div > div > div:has(> p > label[for]), div:has(> i.ug-boxes) + div + div + div > div > div:has(> p > label[for]) { width: auto !important; }
 div:has(> i.ug-row3) ~ div button { padding-inline: 4px; }
 div:has(> i.ug-row2) + div:has(input, button), div:has(> i.ug-row2) + div:has(input, button) + div:has(input, button) { display: inline-block; width: calc((100% - 30px) / 2); margin-inline: 10px 0 !important; }
 .mantine-Button-root[data-disabled] { background: #262c35 !important; color: #697484 !important; }
@@ -147,7 +148,28 @@ label.ug-scan:hover { border-color: #44618a; background: #242b35; }
 .ug-scan-facts { display: flex; justify-content: space-between; gap: 8px; font-size: 11.5px; color: var(--ug-dim); margin-top: 3px; }
 .ug-dots { display: inline-flex; gap: 3px; align-items: center; } .ug-dots i { width: 6px; height: 6px; border-radius: 50%; background: #3a4350; } .ug-dots i.ug-on { background: var(--c); }
 .ug-pager { display: flex; justify-content: center; gap: 24px; padding: 8px; }
-.ug-upload { margin: 0; }
+.ug-upload, .ug-set-up { margin: 0; }
+
+/* a rig without a scan */
+.ug-devices { padding: 0 10px; display: flex; flex-direction: column; gap: 6px; margin-bottom: 6px; }
+.ug-device { background: var(--ug-raised); border-radius: 6px; padding: 6px 10px 7px; }
+.ug-device .ug-name { font-size: 13px; font-weight: 600; color: #eef1f5; }
+.ug-device .ug-note { line-height: 1.4; overflow-wrap: anywhere; }
+.ug-rig-link { display: flex; gap: 8px; align-items: center; padding: 2px 2px 0; }
+.ug-owner { margin-top: 8px; border-left-color: var(--ug-amber); color: #f0c274; }
+.ug-patterns { display: flex; flex-wrap: wrap; gap: 5px; padding: 2px 12px 8px; }
+.ug-pattern { border: 1px solid var(--ug-line); border-radius: 11px; padding: 2px 10px 3px; font-size: 12px; color: #b4bcc8; background: #12151a; }
+label.ug-pattern:hover { border-color: #44618a; color: #fff; } .ug-pattern.ug-on { background: #1d4674; border-color: var(--ug-accent); color: #fff; } .ug-pattern.ug-off { opacity: .55; }
+div:has(> i.ug-bare) + div div:has(> p > label[for]) { width: 42% !important; visibility: hidden; }
+div:has(> i.ug-bare) + div .mantine-NumberInput-root, div:has(> i.ug-bare) + div .mantine-Slider-markWrapper { display: none; }
+div:has(> i.ug-bare) + div { padding-block: 4px 8px !important; }
+.ug-live-card { margin: 2px 12px 8px; }
+.ug-live-head { display: flex; justify-content: space-between; align-items: baseline; font-size: 12.5px; }
+.ug-live-head .ug-name { color: var(--ug-text); font-weight: 600; } .ug-live-head i { display: inline-block; width: 10px; height: 10px; border-radius: 2px; margin-right: 7px; }
+.ug-shares { display: flex; justify-content: space-between; font-size: 12px; color: var(--ug-dim); margin: 2px 0 1px; font-variant-numeric: tabular-nums; } .ug-shares b { font-weight: 500; color: var(--ug-text); }
+.ug-sharp { display: flex; align-items: center; gap: 8px; font-size: 12px; color: var(--ug-dim); } .ug-sharp .ug-progress { flex: 1; margin: 0; } .ug-sharp .ug-value { min-width: 88px; text-align: right; color: var(--ug-text); font-variant-numeric: tabular-nums; }
+.ug-live-foot { display: flex; justify-content: space-between; align-items: baseline; padding: 0 12px 6px; }
+.ug-work { margin: 2px 12px 8px; }
 """
 
 STYLE = f"<style>{_CSS}</style>"

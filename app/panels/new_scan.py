@@ -41,6 +41,7 @@ class NewScanPanel:
         self._doc = gui.add_html("")
         self._rig = gui.add_dropdown("Rig", ["–"])
         self._problem = gui.add_html("", visible=False)
+        self._set_up = gui.add_html("")
         self._preset: Any = gui.add_dropdown("Preset", [_NO_PRESET], visible=False)
         self._name: Any = gui.add_text("Name", "")
         self._note: Any = gui.add_text("Note", "")
@@ -119,6 +120,7 @@ class NewScanPanel:
         self._problem.content = markup.div("ug-why", markup.esc(error)) if error else ""
         self._problem.visible = bool(error)
         self._create.disabled = self._prepare.disabled = bool(error)
+        self._set_up.content = self._set_up_link() if rig else ""
         if rig is None or rig.name == self._made_for:
             return
         self._made_for = rig.name
@@ -144,6 +146,27 @@ class NewScanPanel:
             return rig.name, self.options()
         except UnreadableError:
             return None
+
+    def options_of(self, rig: str) -> dict[str, Any]:
+        """Return the options chosen for a rig; none if another one is chosen."""
+        chosen = self.chosen_rig()
+        return chosen[1] if chosen is not None and chosen[0] == rig else {}
+
+    def _set_up_link(self) -> str:
+        words = "set up this rig: live pictures, light, focus, latency ›"
+        link = self._desk.clicks.label(
+            "set up rig",
+            self._open_rig,
+            words,
+            "ug-link ug-set-up",
+            "The rig without a scan (key L)",
+        )
+        return markup.div("ug-text", link)
+
+    def _open_rig(self) -> None:
+        rig = self._rigs.get(self._rig.value)
+        if rig is not None:
+            self._desk.open_rig(rig.name, None)
 
     def _remember(self, name: str, error: str | None) -> None:
         self._errors = {k: v for k, v in self._errors.items() if k != name} | (

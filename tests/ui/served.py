@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 from backend.api import proxy, viser_messages
 from backend.api.application import create_api
@@ -19,6 +20,7 @@ from backend.api.server import public_socket, server_for
 from backend.api.sessions import Role, Sessions, Tokens
 from backend.api.station import Station
 from backend.contract.requests import CreateScan
+from backend.services.services import Services
 from tests.ui.fake_services import FakeServices
 
 TOKENS = {Role.OPERATOR: "operators-only-7431", Role.VIEWER: "viewers-only-1290"}
@@ -41,7 +43,8 @@ class Served:
     """A running server with its station."""
 
     url: str
-    services: FakeServices
+    services: Any
+    """Those that it was made with: fakes, or real ones around a rig of the tests."""
     station: Station
     messages: Messages
 
@@ -51,7 +54,7 @@ class Served:
 
 
 @contextlib.contextmanager
-def serve(services: FakeServices, *, port: int = 0) -> Iterator[Served]:
+def serve(services: Services, *, port: int = 0) -> Iterator[Served]:
     """Serve until the block ends."""
     listening = public_socket("127.0.0.1", port)
     number = listening.getsockname()[1]

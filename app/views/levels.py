@@ -1,0 +1,57 @@
+"""Gray levels of live pictures: one line per camera over the whole range."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from app.palette import CAMERAS
+from app.views.curve import axes
+
+_HEIGHT_PX = 150
+_BINS = 256
+_TOP = 6.6
+"""log10 of four million pixels."""
+
+
+def camera_colour(order: int) -> str:
+    """Return the colour of a rig's first, second ... camera."""
+    return CAMERAS[order % len(CAMERAS)]
+
+
+class LevelsChart:
+    """The chart in the container that is open when it is made; another set of cameras makes it anew."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._gui = gui
+        self._place = gui.add_folder(None)
+        self._chart: Any = None
+        self._cameras: tuple[str, ...] | None = None
+
+    def show(self, cameras: Sequence[str], histograms: Mapping[str, Sequence[int]]) -> None:
+        """Draw the counts of each camera; one without counts is a line at the bottom."""
+        if tuple(cameras) != self._cameras:
+            self._make(tuple(cameras))
+        none = np.zeros(_BINS)
+        lines = [np.log10(1.0 + np.asarray(histograms.get(c, none), np.float64)) for c in cameras]
+        self._chart.data = (np.arange(_BINS, dtype=np.float64), *lines)
+
+    def _make(self, cameras: tuple[str, ...]) -> None:
+        if self._chart is not None:
+            self._chart.remove()
+        self._cameras = cameras
+        x = np.arange(_BINS, dtype=np.float64)
+        series: list[Any] = [
+            {"label": name, "stroke": camera_colour(i), "fill": f"{camera_colour(i)}30", "width": 1.2, "points": {"show": False}}
+            for i, name in enumerate(cameras)
+        ]  # fmt: skip
+        with self._place:
+            self._chart = self._gui.add_uplot(
+                (x, *(np.zeros(_BINS) for _ in cameras)),
+                ({"label": "gray"}, *series),
+                scales={"x": {"time": False, "range": (0.0, _BINS - 1.0)}, "y": {"range": (0.0, _TOP)}},
+                axes=axes("gray level, 0 to 255 of full scale", "log₁₀ pixels"),
+                legend={"show": False}, cursor={"drag": {"x": False, "y": False}},
+                height=_HEIGHT_PX, padding=(8, 14, 0, 0),
+            )  # fmt: skip
