@@ -67,5 +67,7 @@ def _problem(model: type[DeviceOptions], options: Mapping[str, Any], error: Vali
     if first["type"] == "missing":
         return f"option {option} is missing; add it"
     if first["type"] == "extra_forbidden":
-        return f"there is no option {option!r}; the options are {', '.join(model.model_fields)}"
+        # A driver's own options go before those that it shares with others.
+        names = sorted(model.model_fields, key=lambda name: name not in model.__annotations__)
+        return f"there is no option {option!r}; the options are {', '.join(names)}"
     return f"option {option} can't be {options.get(option, first['input'])!r}: {problem}"

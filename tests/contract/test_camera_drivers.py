@@ -592,6 +592,13 @@ def test_colour_cameras_are_refused_unless_their_green_channel_is_wanted():
     assert made.capabilities().pixel_formats == ("RGB8",)
 
 
+def test_a_camera_opens_with_the_format_of_the_rig_file():
+    made, _ = controls(OLD_NAMES, TRIGGER, pixel_format="Mono12")
+    assert made.read().pixel_format == "Mono12"
+    with pytest.raises(FeatureError, match="left: PixelFormat Mono9 is not one of Mono8, Mono12"):
+        controls(OLD_NAMES, TRIGGER, pixel_format="Mono9")
+
+
 def test_a_region_is_set_from_the_corner_outwards():
     offsets = {"OffsetX": (64.0, 0, 600, 16, ""), "OffsetY": (0.0, 0, 400, 1, "")}
     _, features = controls({**OLD_NAMES, **offsets}, TRIGGER, region=[32, 10, 320, 200])

@@ -75,6 +75,8 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_set_float": (None, (_POINTER, _TEXT, _DOUBLE)),
     "arv_camera_get_float_bounds": (None, (_POINTER, _TEXT, ctypes.POINTER(_DOUBLE), ctypes.POINTER(_DOUBLE))),
     "arv_camera_get_float_increment": (_DOUBLE, (_POINTER, _TEXT)),
+    "arv_camera_get_integer_bounds": (None, (_POINTER, _TEXT, ctypes.POINTER(_LONG), ctypes.POINTER(_LONG))),
+    "arv_camera_get_integer_increment": (_LONG, (_POINTER, _TEXT)),
     "arv_camera_dup_available_enumerations_as_strings": (ctypes.POINTER(_TEXT), (_POINTER, _TEXT, ctypes.POINTER(_UINT))),
     "arv_camera_execute_command": (None, (_POINTER, _TEXT)),
     "arv_camera_get_payload": (_UINT, (_POINTER,)),

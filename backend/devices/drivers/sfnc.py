@@ -28,6 +28,8 @@ _READOUT_S = 0.004
 class SfncOptions(DeviceOptions):
     """What every GenICam camera may be told in a rig file."""
 
+    pixel_format: str | None = None
+    """SFNC PixelFormat to open with, e.g. Mono12; None: what the camera is set to."""
     region: tuple[int, int, int, int] | None = None
     """Left, top, width, height in [px] of what is read of the sensor; None: what the camera is set to."""
     exposure_us: float | None = Field(None, gt=0)
@@ -132,9 +134,7 @@ class SfncControls:
             ("GainAuto", "Off"), ("GainSelector", "All"),
         ):  # fmt: skip
             self._set_if_possible(name, value)
-        formats = self._formats()
-        if features.text("PixelFormat") not in formats:
-            features.set_text("PixelFormat", formats[0])
+        self._choose_format()
         self._read_region()
         for selector in features.choices("TriggerSelector"):  # another one may hold frames back
             features.set_text("TriggerSelector", selector)
@@ -142,6 +142,19 @@ class SfncControls:
         self._set_if_possible("TriggerSelector", "FrameStart")
         self._set_if_possible("TriggerActivation", "RisingEdge")
         self._set_trigger(self._sources()[0])
+
+    def _choose_format(self) -> None:
+        formats, wanted = self._formats(), self._options.pixel_format
+        now = self._features.text("PixelFormat")
+        if wanted is None:
+            wanted = now if now in formats else formats[0]
+        if wanted not in formats:
+            raise FeatureError(
+                self._camera,
+                f"PixelFormat {wanted} is not one of {', '.join(formats)}; choose one of them",
+            )
+        if wanted != now:
+            self._features.set_text("PixelFormat", wanted)
 
     def _set_if_possible(self, name: str, value: str) -> None:
         if value in self._features.choices(name) and self._features.text(name) != value:
@@ -217,8 +230,9 @@ class SfncControls:
     def _sources(self) -> tuple[TriggerSource, ...]:
         modes = self._features.choices("TriggerMode")
         there = set(self._features.choices("TriggerSource")) if "On" in modes else set()
-        wired = [s for s in TriggerSource if s.value in there and s is not TriggerSource.FREE_RUN]
-        return (*wired, TriggerSource.FREE_RUN)
+        free_run = TriggerSource.FREE_RUN
+        sources = tuple(s for s in TriggerSource if s.value in there and s is not free_run)
+        return (*sources, free_run) if "Off" in modes or not sources else sources
 
     def _readout_s(self) -> float:
         known = self._features.has("SensorReadoutTime")

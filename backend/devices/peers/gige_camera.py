@@ -182,6 +182,7 @@ class GigECamera:
         registers.number(Bootstrap.TICK_FREQUENCY_LOW, _TICKS_PER_S & 0xFFFF_FFFF)
         registers.number(Bootstrap.PACKET_SIZE, 1500)
         registers.memory(features.XML_ADDRESS, xml)
+        registers.number(features.TRIGGER_MODE.address, features.TRIGGER_MODE_ON)
         registers.number(features.WIDTH.address, width_px)
         registers.number(features.HEIGHT.address, height_px)
         self._allow_writes()
