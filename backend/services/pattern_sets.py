@@ -26,7 +26,16 @@ from backend.devices.pattern_set import (
     write_set,
 )
 from backend.domain.errors import ConflictError, InvalidSettingError, UnglareError
-from backend.domain.patterns import BLACK, WHITE, Gray, Pattern, Sine, Stripe, Uniform
+from backend.domain.patterns import (
+    BLACK,
+    WHITE,
+    Gray,
+    Pattern,
+    Sine,
+    StaticPicture,
+    Stripe,
+    Uniform,
+)
 from backend.domain.states import StageStatus, Verdict
 from backend.jobs.rendering import render
 from backend.numerics.errors import PatternError
@@ -198,13 +207,13 @@ def pictures_of(
             stages.setdefault(pattern, []).append(name)
         if shown.masked:
             left_out.append(
-                f"{title} ({name}) shows {shown.masked} patterns through a mask that is made of the scan's own"
-                " frames: they can't be exported."
+                f"{title} ({name}): {_patterns(shown.masked)} can't be exported, as a mask that is made of the scan's"
+                " own frames dims them."
             )
         if len(fixed) < len(shown.free):
             left_out.append(
-                f"{title} ({name}) shows {len(shown.free) - len(fixed)} patterns that depend on the scan's own frames:"
-                " they can't be exported."
+                f"{title} ({name}): {_patterns(len(shown.free) - len(fixed))} can't be exported, as the scan's own"
+                " frames decide on them."
             )
     left_out += [
         f"{first.titles[name]} ({name}) wasn't reached in the trial, what it shows is missing: {first.reason}"
@@ -341,6 +350,15 @@ def _stripe(pattern: Stripe) -> str:
 @describe.register
 def _uniform(pattern: Uniform) -> str:
     return f"even field, gray {pattern.gray:g}"
+
+
+@describe.register
+def _nothing(pattern: StaticPicture) -> str:
+    return "nothing"
+
+
+def _patterns(count: int) -> str:
+    return "1 pattern" if count == 1 else f"{count} patterns"
 
 
 def _along(axis: str) -> str:

@@ -4,7 +4,7 @@ of it and GigE Vision cameras on its trigger line."""
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,14 +32,13 @@ from backend.devices.errors import (
 from backend.devices.pages import PageDesk
 from backend.devices.pattern_set import NewPattern, PatternSet, write_set
 from backend.devices.peers.dlpc350 import SimulatedDlpc350, load_ms
-from backend.devices.peers.gige_camera import GigECamera
-from backend.devices.protocols import LinkState, SequenceProjector, TriggerSource
-from backend.devices.sim import create_rig
+from backend.devices.protocols import LinkState, Rig, SequenceProjector, TriggerSource
 from backend.domain.patterns import Sine, Uniform
 from backend.jobs.rendering import render
+from tests.lightcrafter_hardware import lightcrafter_hardware
 
 WIDTH, HEIGHT = protocol.SIZE_PX
-LEVELS = (0, 32, 64, 100, 128, 200, 255)
+LEVELS = (0, 32, 50, 64, 100, 128, 150, 200, 255)
 STEPS = 24
 
 
@@ -54,7 +53,7 @@ def fringe(step: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A set of 24 fringes and some even fields: 31 patterns of 8 bit in 11 images."""
+    """A set of 24 fringes and some even fields: 33 patterns of 8 bit in 11 images."""
     path = tmp_path_factory.mktemp("patterns")
     fields = [
         NewPattern(even(level), f"even {level}", Uniform(gray=level).model_dump(mode="json"))
@@ -254,7 +253,8 @@ def test_even_fields_come_from_the_set(projector, bench):
         assert projector.blank(level).index == -1
         assert shows(bench, even(level))
     with pytest.raises(
-        FeatureError, match=r"level 77 isn't in the set .* use one of 0, 32, 64, 100, 128, 200, 255"
+        FeatureError,
+        match=r"level 77 isn't in the set .* use one of 0, 32, 50, 64, 100, 128, 150, 200, 255",
     ):
         projector.blank(77)
 
@@ -568,14 +568,6 @@ except AravisMissingError as error:
 else:
     needs_aravis = pytest.mark.xdist_group("gige-vision")
 
-SCENE = {
-    "scene": "plane",
-    "size": "160x120",
-    "projector_size": f"{WIDTH}x{HEIGHT}",
-    "realtime": True,
-    "frame_period_ms": None,
-}
-
 
 @pytest.fixture
 def addresses(worker_id: str) -> tuple[str, str]:
@@ -585,20 +577,18 @@ def addresses(worker_id: str) -> tuple[str, str]:
 
 
 @contextmanager
-def laboratory(addresses: tuple[str, str], folder: Path, flash: tuple[np.ndarray, ...]):
-    """A scene that the simulated LightCrafter lights and GigE Vision cameras on its trigger line look at."""
-    simulated = create_rig(SCENE)
-    with simulated, ExitStack() as stack:
-        device = stack.enter_context(SimulatedDlpc350(simulated.projector, flash))
-        for camera, address in zip(simulated.cameras.values(), addresses, strict=True):
-            stack.enter_context(GigECamera(camera, address))
+def laboratory(addresses: tuple[str, str], folder: Path) -> Iterator[Rig]:
+    """The rig that an operator would open."""
+    with lightcrafter_hardware(addresses, folder) as (device, _):
         cameras = {
             name: AravisCamera(name, AravisOptions(address=address))
             for name, address in zip(("left", "right"), addresses, strict=True)
         }
         sensors = dict.fromkeys(cameras, SensorFacts(8, 4.0, 15_300.0, 12.0))
         projector = projector_of(device, folder, settle_ms=10.0)
-        with AssembledRig("bench", cameras, projector, sensors=sensors) as rig:
+        lines = dict.fromkeys(cameras, TriggerSource.LINE1)
+        rig = AssembledRig("bench", cameras, projector, sensors=sensors, trigger_lines=lines)
+        with rig:
             yield rig
 
 
@@ -607,15 +597,15 @@ class TestLightCrafterWithGigEVision(RigConformance):
     has_light = True
 
     @pytest.fixture
-    def rig(self, addresses, folder, flash):
-        with laboratory(addresses, folder, flash) as rig:
+    def rig(self, addresses, folder):
+        with laboratory(addresses, folder) as rig:
             yield rig
 
 
 @needs_aravis
-def test_a_sequence_brings_every_frame_of_every_camera(addresses, folder, flash):
+def test_a_sequence_brings_every_frame_of_every_camera(addresses, folder):
     """24 fringes at 16.7 ms: 24 frames of each camera, in order, equally spaced by its own clock."""
-    with laboratory(addresses, folder, flash) as rig:
+    with laboratory(addresses, folder) as rig:
         rig.projector.load([fringe(k) for k in range(STEPS)])
         for camera in rig.cameras.values():
             camera.configure(

@@ -1,0 +1,73 @@
+"""A whole scan by the projector's clock: a rig file, a LightCrafter that plays from flash, cameras on its trigger line."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from backend.contract.requests import CreateScan
+from backend.devices import dlpc350_protocol as protocol
+from backend.devices.drivers.aravis_library import AravisMissingError, aravis
+from backend.devices.pattern_set import NewPattern, write_set
+from backend.domain.patterns import BLACK, WHITE, Pattern
+from backend.domain.rig import ProjectorFacts
+from backend.domain.states import StageStatus
+from backend.jobs.rendering import render
+from backend.services.simulated_hardware import _calibration
+from backend.stages.exposures import ExposuresParams, _design
+from tests.lightcrafter_hardware import lightcrafter_hardware
+from tests.scans.houses import real_house, run_unattended, stage_of
+
+try:
+    aravis()
+except AravisMissingError as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+pytestmark = [pytest.mark.scan, pytest.mark.xdist_group("gige-vision")]
+
+WIDTH, HEIGHT = protocol.SIZE_PX
+
+
+def stored(folder: Path, *patterns: Pattern) -> Path:
+    pictures = [render(p, width_px=WIDTH, height_px=HEIGHT) for p in patterns]
+    write_set(folder, [NewPattern(p, "pattern") for p in pictures], pack=True)
+    return folder
+
+
+def test_a_scan_plays_from_flash_and_every_frame_comes(tmp_path, worker_id):
+    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 98
+    addresses = [f"127.80.{number}.2", f"127.80.{number}.3"]
+    fringes = _design(ExposuresParams()).patterns(ProjectorFacts(WIDTH, HEIGHT))
+    folder = stored(tmp_path / "set", *fringes, WHITE, BLACK)
+    with lightcrafter_hardware(addresses, folder) as (device, simulated):
+        device.listen(str(tmp_path / "lcr"))
+        calibration = simulated.calibration()
+        assert calibration is not None
+        cameras = {
+            name: {
+                "driver": "aravis",
+                "address": address,
+                "trigger_line": "Line1",
+                "sensor": {"black_level_gray": 4.0, "full_well_e": 15_300.0, "read_noise_e": 12.0},
+            }
+            for name, address in zip(("left", "right"), addresses, strict=True)
+        }
+        projector = {
+            "driver": "dlpc350",
+            "patterns": str(folder),
+            "transport": f"unix:{tmp_path / 'lcr'}",
+        }
+        rig = {"cameras": cameras, "projector": projector, "calibration": _calibration(calibration)}
+        data = tmp_path / "data"
+        (data / "rigs").mkdir(parents=True)
+        (data / "rigs" / "bench.yaml").write_text(yaml.safe_dump(rig))
+        with real_house(data) as services:
+            one_exposure = {"exposures": {"exposures_ms": [25.0]}}
+            request = CreateScan(method="hdr-fringe", rig="bench", settings=one_exposure)
+            made = services.create_scan(request, "test")
+            state = run_unattended(services, made.id)
+        assert device.late_images == 0
+    assert {stage.status for stage in state.stages} == {StageStatus.DONE}, state
+    assert stage_of(state, "stereo_cloud").message
+    assert state.job is not None
+    assert state.job.error is None
