@@ -213,6 +213,24 @@ def test_opening_again_after_a_loss_gives_the_old_connection_back(addresses):
         assert camera.get_frame().data.shape == (120, 160)
 
 
+def test_a_camera_that_runs_freely_shows_the_new_pattern_after_the_frames_that_waited(addresses):
+    with network(addresses) as (simulated, peers), opened(addresses) as camera:
+        simulated.projector.blank(0)
+        camera.configure(replace(camera.settings, trigger=TriggerSource.FREE_RUN))
+        camera.arm()
+        dark = float(camera.get_frame().data.mean())
+        sent = peers[0]._block_id
+        while (
+            peers[0]._block_id < sent + 5
+        ):  # as nobody fetches, every buffer holds a dark frame then
+            time.sleep(0.01)
+        simulated.projector.blank(255)
+        means = [float(camera.get_frame().data.mean()) for _ in range(8)]
+    waiting = camera.capabilities.buffered_frames + 1
+    assert means[0] == pytest.approx(dark, abs=1.0)
+    assert min(means[waiting:]) > dark + 5
+
+
 def test_a_line_triggered_sequence_brings_every_frame(addresses):
     """24 patterns at 16.7 ms: 24 frames of each camera, equally spaced by its own clock."""
     steady = network(addresses, frame_period_ms=None)  # light that isn't modulated within 16.7 ms

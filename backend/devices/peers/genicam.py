@@ -34,13 +34,13 @@ ACQUISITION_STOP = Register(FEATURES + 0x18, access="WO")
 PARAMETERS_LOCKED = Register(FEATURES + 0x1C)
 TRIGGER_SELECTOR = Register(FEATURES + 0x20)
 TRIGGER_MODE = Register(FEATURES + 0x24)
-TRIGGER_MODE_ON = 1
 TRIGGER_SOURCE = Register(FEATURES + 0x28)
 TRIGGER_SOFTWARE = Register(FEATURES + 0x2C, access="WO")
 TRIGGER_ACTIVATION = Register(FEATURES + 0x30)
 EXPOSURE_TIME = Register(FEATURES + 0x40, 8)
 GAIN = Register(FEATURES + 0x48, 8)
 
+TRIGGER_MODES = {"Off": 0, "On": 1}
 TRIGGER_SOURCES = {"Software": 0, "Line0": 1, "Line1": 2}
 
 
@@ -111,7 +111,7 @@ def _acquisition(writer: "_Writer", camera: CameraDescription) -> None:
     writer.command("AcquisitionStart", ACQUISITION_START)
     writer.command("AcquisitionStop", ACQUISITION_STOP)
     writer.choice("TriggerSelector", TRIGGER_SELECTOR, {"FrameStart": 0})
-    writer.choice("TriggerMode", TRIGGER_MODE, {"On": TRIGGER_MODE_ON})  # it never runs freely
+    writer.choice("TriggerMode", TRIGGER_MODE, TRIGGER_MODES)
     writer.choice("TriggerSource", TRIGGER_SOURCE, sources)
     writer.command("TriggerSoftware", TRIGGER_SOFTWARE)
     writer.choice("TriggerActivation", TRIGGER_ACTIVATION, {"RisingEdge": 0})

@@ -182,7 +182,7 @@ class GigECamera:
         registers.number(Bootstrap.TICK_FREQUENCY_LOW, _TICKS_PER_S & 0xFFFF_FFFF)
         registers.number(Bootstrap.PACKET_SIZE, 1500)
         registers.memory(features.XML_ADDRESS, xml)
-        registers.number(features.TRIGGER_MODE.address, features.TRIGGER_MODE_ON)
+        registers.number(features.TRIGGER_MODE.address, features.TRIGGER_MODES["On"])
         registers.number(features.WIDTH.address, width_px)
         registers.number(features.HEIGHT.address, height_px)
         self._allow_writes()
@@ -192,11 +192,12 @@ class GigECamera:
         plain = (
             Bootstrap.HEARTBEAT_MS, Bootstrap.STREAM_PORT, Bootstrap.PACKET_DELAY, Bootstrap.STREAM_ADDRESS,
             features.ACQUISITION_MODE.address, features.PARAMETERS_LOCKED.address,
-            features.TRIGGER_SELECTOR.address, features.TRIGGER_MODE.address, features.TRIGGER_ACTIVATION.address,
+            features.TRIGGER_SELECTOR.address, features.TRIGGER_ACTIVATION.address,
         )  # fmt: skip
         acting: dict[int, Writer] = {
             Bootstrap.PACKET_SIZE: self._set_packet_size,
             features.PIXEL_FORMAT.address: self._set_pixel_format,
+            features.TRIGGER_MODE.address: self._set_trigger_mode,
             features.TRIGGER_SOURCE.address: self._set_trigger_source,
             features.ACQUISITION_START.address: lambda _: self._start_acquisition(),
             features.ACQUISITION_STOP.address: lambda _: self._stop_acquisition(),
@@ -236,6 +237,20 @@ class GigECamera:
         if name is None:
             raise RefusedError(Status.INVALID_PARAMETER)
         self._set(pixel_format=name)
+
+    def _set_trigger_mode(self, data: bytes) -> None:
+        """Let the camera wait for triggers or run freely; then frames are triggered here, one after the other."""
+        mode = int.from_bytes(data)
+        if mode not in features.TRIGGER_MODES.values():
+            raise RefusedError(Status.INVALID_PARAMETER)
+        if mode == features.TRIGGER_MODES["Off"]:
+            self._set(trigger=TriggerSource.SOFTWARE)
+        self._registers.number(features.TRIGGER_MODE.address, mode)
+
+    @property
+    def _runs_freely(self) -> bool:
+        mode = self._registers.read_number(features.TRIGGER_MODE.address)
+        return mode == features.TRIGGER_MODES["Off"]
 
     def _set_trigger_source(self, data: bytes) -> None:
         names = {number: name for name, number in features.TRIGGER_SOURCES.items()}
@@ -366,7 +381,8 @@ class GigECamera:
     def _trigger(self) -> None:
         """Expose now; a trigger during an exposure is lost, as on real cameras, and counted."""
         settings, now_s = self._camera.settings, time.monotonic()
-        if not self._acquiring.is_set() or settings.trigger is not TriggerSource.SOFTWARE:
+        waits = settings.trigger is TriggerSource.SOFTWARE and not self._runs_freely
+        if not (waits and self._acquiring.is_set()):
             return
         if now_s < self._free_at_s:
             self.dropped_triggers += 1
@@ -381,6 +397,8 @@ class GigECamera:
                 continue
             acquisition = self._acquisitions
             try:
+                if self._runs_freely:
+                    self._camera.trigger()
                 frame = self._camera.get_frame(timeout_s=_POLL_S)
             except DeviceTimeout:
                 continue
@@ -389,7 +407,8 @@ class GigECamera:
                 self._acquiring.clear()
                 continue
             except DeviceError as error:
-                log.warning("No frame is sent: %s", error)
+                if self._acquiring.is_set():  # else acquisition was stopped before the trigger
+                    log.warning("No frame is sent: %s", error)
                 continue
             # A picture that took so long that acquisition was started anew meanwhile belongs to nobody.
             if self._acquiring.is_set() and acquisition == self._acquisitions:
