@@ -24,6 +24,8 @@ ANSWER_S = 20.0
 """How long a call may take beyond what it was told to wait, unless the device says otherwise (`KnowsItsPace`)."""
 AFTER_STOP_S = 3.0
 """How long a call may go on, at least, once its job is to end: `abort` should have ended it at once."""
+_MOMENT_S = 1.0
+"""How long whoever aborts or closes a device beside its own thread waits for that."""
 _LOOK_S = 0.1
 """So often whoever waits looks whether the job is to end."""
 
@@ -254,9 +256,9 @@ class DeviceThreads:
             aside(device.abort)
 
 
-def aside(work: Callable[[], None], *, within_s: float = 1.0) -> None:
+def aside(work: Callable[[], None]) -> None:
     """Call a driver from a thread of its own and wait a moment; it may go on, and what it raises is its own matter."""
-    wait([DriverThread("aside").submit(work)], timeout=within_s)
+    wait([DriverThread("aside").submit(work)], timeout=_MOMENT_S)
 
 
 def _error_of(call: DriverCall[T]) -> BaseException | None:

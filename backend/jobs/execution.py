@@ -31,6 +31,7 @@ from backend.jobs.journal import DatabaseJournal
 from backend.jobs.live import LivePicture
 from backend.jobs.loading import NO_RIG, LoadedScan, load_inputs, load_scan
 from backend.jobs.plan import Gate, PlannedStage, next_step
+from backend.jobs.rig_thread import wait_for
 from backend.jobs.rigs import Owner, RigGiven, RigPool
 from backend.jobs.sequence_shooting import shooter_of
 from backend.jobs.shooting import Shooter
@@ -198,7 +199,8 @@ class JobExecution:
 
     def _open_rig(self, scan: LoadedScan) -> None:
         """Do what `create_scan` couldn't because the rig was busy."""
-        rig = self._shop.rigs.given(scan.row.rig, scan.row.rig_options)
+        asked = self._shop.rigs.ask(scan.row.rig, scan.row.rig_options)
+        rig = wait_for(asked, self.control)
         with self._shop.database.transaction() as repositories:
             store_rig(repositories, self._shop.store, scan.method, scan.row.id, rig)
 

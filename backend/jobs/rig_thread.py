@@ -167,9 +167,14 @@ def _patience_s(rig: Rig) -> float:
 
 
 def _unfinished(rig: Rig, doing: str) -> str | None:
-    """Return the device that a rig is stuck in: they are opened and closed one after the other."""
-    done = (LinkState.CLOSED,) if doing == CLOSING else (LinkState.READY, LinkState.ARMED)
-    return next((device.name for device in _devices(rig) if device.state not in done), None)
+    """Return the device that a rig is stuck in: projector first, they are opened one after the other, or closed last."""
+    projector, cameras = _devices(rig)[:1], _devices(rig)[1:]
+    if doing == CLOSING:
+        left = [d for d in (*cameras, *projector) if d.state is not LinkState.CLOSED]
+    else:
+        ready = (LinkState.READY, LinkState.ARMED)
+        left = [d for d in (*projector, *cameras) if d.state not in ready]
+    return left[0].name if left else None
 
 
 def _close_others(rig: Rig, stuck: set[str]) -> None:

@@ -406,8 +406,10 @@ class _Slot:
         return self._thread.submit(self._close)
 
     def leave_stuck(self) -> None:
-        """Leave the rig behind if a call into one of its drivers is stuck."""
-        self._thread.submit(self._leave_if_stuck).result()
+        """Leave the rig behind if a call into one of its drivers is stuck; doesn't wait for one that is opening."""
+        threads = self._threads
+        if threads is not None and threads.stuck:
+            self._thread.submit(self._leave_if_stuck).result()
 
     def connect(self, options: Mapping[str, Any], *, anew: bool = False) -> None:
         with self._lock:
@@ -513,12 +515,12 @@ class _Slot:
     def _open_anew(self, rig: Rig, options: Mapping[str, Any]) -> None:
         with self._thread.beside_what_is_stuck(), self._thread.limited(rig, OPENING):
             rig.open()
-        try:
-            self._tell_opened(self.name, _canonical(options), rig)
-            self._devices, self._facts = _known(rig), rig.facts()
-        except BaseException:
-            rig.close()
-            raise
+            try:
+                self._tell_opened(self.name, _canonical(options), rig)
+                self._devices, self._facts = _known(rig), rig.facts()
+            except BaseException:
+                rig.close()
+                raise
         self._threads = DeviceThreads(known.device for known in self._devices)
         self._rig, self._options = rig, _canonical(options)
 
@@ -561,6 +563,8 @@ class _Slot:
         try:
             self.live.update(self._bench.take(wish))
         except UnglareError as error:
+            if self._link is RigLink.CLOSING:
+                return  # whoever disconnects doesn't want the picture
             if error.sentence != self._failure:
                 log.warning("No live picture of rig %r: %s", self.name, error)
             self._failure = error.sentence
