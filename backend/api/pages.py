@@ -125,6 +125,8 @@ async def public_file(name: str, request: Request) -> Response:
 def login_page_for(request: Request) -> Response:
     """Send somebody to the login page who then comes back here."""
     here = request.url.path
+    if request.url.query:
+        here = f"{here}?{request.url.query}"
     return RedirectResponse("/login" if here == HOME else f"/login?next={quote(here)}", 303)
 
 
