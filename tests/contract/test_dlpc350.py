@@ -74,6 +74,7 @@ class Bench:
     """A lamp that remembers what it showed when the trigger line fired."""
 
     def __init__(self) -> None:
+        self.changed = threading.Condition()
         self.picture = even(0)
         self.lit: list[np.ndarray] = []
         self.edges: list[tuple[float, float]] = []
@@ -82,7 +83,9 @@ class Bench:
         return time.monotonic()
 
     def light(self, picture: np.ndarray) -> None:
-        self.picture = picture
+        with self.changed:
+            self.picture = picture
+            self.changed.notify_all()
 
     def edge(self, time_s: float, shown_us: float) -> None:
         self.lit.append(self.picture)
@@ -118,12 +121,8 @@ def projector(device, folder) -> Iterator[Dlpc350Projector]:
 
 def shows(bench: Bench, wanted: np.ndarray) -> bool:
     """Wait for a picture to come to light."""
-    deadline_s = time.monotonic() + 5
-    while time.monotonic() < deadline_s:
-        if np.array_equal(bench.picture, wanted):
-            return True
-        time.sleep(0.002)
-    return False
+    with bench.changed:
+        return bench.changed.wait_for(lambda: np.array_equal(bench.picture, wanted), timeout=5)
 
 
 def ran(device: SimulatedDlpc350) -> None:
