@@ -14,6 +14,7 @@ from backend.devices.errors import RigConfigError
 from backend.devices.pages import PageDesk
 from backend.devices.plug_ins import call_plug_in, lacking, load_plug_in, package_of, plug_ins
 from backend.devices.protocols import Camera, Projector
+from backend.domain.errors import UnglareError
 
 CAMERAS = "unglare.cameras"
 PROJECTORS = "unglare.projectors"
@@ -93,8 +94,9 @@ def driver_entries(group: str) -> tuple[DriverEntry, ...]:
 def load_factory(group: str, name: str, driver: str) -> Callable[..., Any]:
     """Import a driver and return its factory; `name` is what sentences call the device.
 
-    A factory may have attributes: `options_model`, the pydantic model of the options that it takes, and of a
-    camera's `search`, a function that returns a `FoundCamera` for each camera it can see. Searching may
+    A factory may have attributes: `options_model`, the pydantic model of the options that it takes, `library`, which
+    raises a sentence where a library that the devices need is missing (`options.takes` sets both), and of a camera's
+    `search`, a function that returns a `FoundCamera` for each camera it can see. Searching may
     broadcast: it is only called when an operator asks for it.
 
     Raises
@@ -110,6 +112,17 @@ def load_factory(group: str, name: str, driver: str) -> Callable[..., Any]:
         )
     made: Callable[..., Any] = factory
     return made
+
+
+def missing_library(factory: Callable[..., Any]) -> str | None:
+    """Return the sentence with the install command where the library that a driver needs isn't there."""
+    look = getattr(factory, "library", None)
+    try:
+        if look is not None:
+            call_plug_in("the driver's library", look, "install it anew")
+    except UnglareError as error:
+        return error.sentence
+    return None
 
 
 def _imported(group: str, name: str, driver: str) -> Any:

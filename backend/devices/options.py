@@ -24,20 +24,28 @@ SerialNumber = Annotated[str, Field(coerce_numbers_to_str=True)]
 
 
 class DeviceOptions(BaseModel):
-    """Base of the options that a rig or driver takes."""
+    """Base of the options that a rig or driver takes; the sentence under a field is shown to operators."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 AnyOptions = TypeVar("AnyOptions", bound=DeviceOptions)
 AnyFactory = TypeVar("AnyFactory", bound=Callable[..., object])
 
 
-def takes(model: type[DeviceOptions]) -> Callable[[AnyFactory], AnyFactory]:
-    """Declare the options of a factory of cameras, projectors or rigs: lists and forms show them."""
+def takes(
+    model: type[DeviceOptions], *, library: Callable[[], object] | None = None
+) -> Callable[[AnyFactory], AnyFactory]:
+    """Declare the options of a factory of cameras, projectors or rigs: lists and forms show them.
+
+    `library` raises a sentence with the install command where the library that the devices need isn't there.
+    """
 
     def declared(factory: AnyFactory) -> AnyFactory:
         factory.options_model = model  # type: ignore[attr-defined]  # read by loading.schema_of
+        factory.library = library  # type: ignore[attr-defined]  # read by driver_loading.missing_library
         return factory
 
     return declared

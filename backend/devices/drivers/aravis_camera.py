@@ -31,7 +31,7 @@ from backend.devices.errors import (
 )
 from backend.devices.found import FoundCamera
 from backend.devices.frame_counting import FrameCounter
-from backend.devices.options import SerialNumber, read_options
+from backend.devices.options import SerialNumber, read_options, takes
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -70,12 +70,17 @@ class AravisOptions(SfncOptions):
         return self
 
 
+def _library() -> None:
+    try:
+        aravis()
+    except AravisMissingError as error:
+        raise DeviceNotFound("aravis", str(error)) from error
+
+
+@takes(AravisOptions, library=_library)
 def create_camera(name: str, options: Mapping[str, Any]) -> "AravisCamera":
     """Make a camera of a rig file's entry."""
     return AravisCamera(name, read_options(AravisOptions, name, options))
-
-
-create_camera.options_model = AravisOptions  # type: ignore[attr-defined]  # read by driver_loading
 
 
 class AravisCamera(LibraryCamera):

@@ -26,7 +26,7 @@ from pydantic import Field, field_validator
 
 from backend.devices import dlpc350_protocol as protocol
 from backend.devices.dlpc350_protocol import Action, Command, LutEntry, Mailbox, Validation
-from backend.devices.drivers.dlpc350_link import Commands, Connect, connection
+from backend.devices.drivers.dlpc350_link import Commands, Connect, connection, hidapi
 from backend.devices.errors import (
     DeviceBusy,
     DeviceDisconnected,
@@ -37,7 +37,7 @@ from backend.devices.errors import (
     RigConfigError,
 )
 from backend.devices.link import Link
-from backend.devices.options import DeviceOptions, read_options
+from backend.devices.options import DeviceOptions, read_options, takes
 from backend.devices.pages import PageDesk
 from backend.devices.pattern_set import PatternSet, SetPattern, pattern_hash
 from backend.devices.protocols import DeviceInfo, LinkState, Presented, ProjectorCapabilities
@@ -105,6 +105,7 @@ class Dlpc350Options(DeviceOptions):
         return value
 
 
+@takes(Dlpc350Options, library=lambda: hidapi("dlpc350"))
 def create_projector(name: str, options: Mapping[str, Any], desk: PageDesk) -> "Dlpc350Projector":
     """Make a projector of a rig file's entry."""
     del desk  # it has no page

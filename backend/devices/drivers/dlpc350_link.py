@@ -65,6 +65,27 @@ def connection(transport: str) -> Connect:
     raise ValueError("use usb, usb:SERIAL or unix:/PATH/OF/A/SIMULATED/DEVICE")
 
 
+def hidapi(name: str) -> Any:
+    """Import the library, an extra: only where a LightCrafter is opened.
+
+    Raises
+    ------
+    DeviceNotFound
+        If it isn't installed.
+    """
+    try:
+        hid: Any = importlib.import_module("hid")
+    except ImportError as error:
+        raise DeviceNotFound(
+            name, f"a LightCrafter needs the package hidapi; install it: {INSTALL}"
+        ) from error
+    if not hasattr(hid, "device"):  # another package has the same name
+        raise DeviceNotFound(
+            name, f"the package hid stands before hidapi; run: pip uninstall hid; {INSTALL}"
+        )
+    return hid
+
+
 def open_usb(name: str, serial: str = "") -> HidLike:
     """Open the LightCrafter on USB.
 
@@ -75,16 +96,7 @@ def open_usb(name: str, serial: str = "") -> HidLike:
     DeviceBusy
         If it is there but can't be opened.
     """
-    try:
-        hid: Any = importlib.import_module("hid")  # an extra: only where a LightCrafter is opened
-    except ImportError as error:
-        raise DeviceNotFound(
-            name, f"a LightCrafter needs the package hidapi; install it: {INSTALL}"
-        ) from error
-    if not hasattr(hid, "device"):  # another package has the same name
-        raise DeviceNotFound(
-            name, f"the package hid stands before hidapi; run: pip uninstall hid; {INSTALL}"
-        )
+    hid = hidapi(name)
     there = [
         found
         for found in hid.enumerate(protocol.VENDOR_ID, protocol.PRODUCT_ID)

@@ -33,7 +33,7 @@ from backend.devices.errors import (
 )
 from backend.devices.found import FoundCamera
 from backend.devices.frame_counting import FrameCounter
-from backend.devices.options import SerialNumber, read_options
+from backend.devices.options import SerialNumber, read_options, takes
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -61,12 +61,14 @@ class GentlOptions(SfncOptions):
     """The camera's serial number."""
 
 
+def _library() -> None:
+    imported("gentl", "harvesters.core", "gentl")
+
+
+@takes(GentlOptions, library=_library)
 def create_camera(name: str, options: Mapping[str, Any]) -> "GentlCamera":
     """Make a camera of a rig file's entry."""
     return GentlCamera(name, read_options(GentlOptions, name, options))
-
-
-create_camera.options_model = GentlOptions  # type: ignore[attr-defined]  # read by driver_loading
 
 
 class GentlCamera(LibraryCamera):

@@ -23,7 +23,7 @@ from backend.devices.errors import (
     GeometryError,
 )
 from backend.devices.link import Link
-from backend.devices.options import DeviceOptions, DisplaySize, read_options
+from backend.devices.options import DeviceOptions, DisplaySize, read_options, takes
 from backend.devices.pages import Geometry, Page, PageDesk
 from backend.devices.protocols import DeviceInfo, LinkState, Presented, ProjectorCapabilities
 from backend.devices.refusals import refuse_level, refuse_other_sizes, refuse_unloaded
@@ -62,6 +62,7 @@ class PageOptions(DeviceOptions):
     """What the latency calibration found, kept beside the rig's file; holds for the screen it was measured on."""
 
 
+@takes(PageOptions)
 def create_projector(name: str, options: Mapping[str, Any], desk: PageDesk) -> "PageProjector":
     """Make a projector of a rig file's entry."""
     return PageProjector(name, read_options(PageOptions, name, options), desk)

@@ -10,7 +10,6 @@ exposure and gain. Never run on a real camera: control by somebody else, removal
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +29,12 @@ from backend.devices.errors import (
 )
 from backend.devices.found import FoundCamera
 from backend.devices.frame_counting import FrameCounter
-from backend.devices.options import SerialNumber, read_options
+from backend.devices.options import SerialNumber, read_options, takes
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
     DeviceInfo,
     Frame,
-    Range,
     TriggerSource,
 )
 
@@ -49,8 +47,6 @@ _FREE_RUN_BUFFERS = 3
 _TICKS_PER_S = 1e9
 _CONTROLLED = "another"
 """Word in pylon's sentences about cameras that another application or client has opened."""
-_EMULATED_STEP_US = 1.0
-"""An emulated camera says 0.1 us and takes whole ones."""
 
 
 class PylonOptions(SfncOptions):
@@ -76,12 +72,14 @@ class PylonOptions(SfncOptions):
         return self
 
 
+def _library() -> None:
+    imported("pylon", "pypylon.pylon", "pylon")
+
+
+@takes(PylonOptions, library=_library)
 def create_camera(name: str, options: Mapping[str, Any]) -> "PylonCamera":
     """Make a camera of a rig file's entry."""
     return PylonCamera(name, read_options(PylonOptions, name, options))
-
-
-create_camera.options_model = PylonOptions  # type: ignore[attr-defined]  # read by driver_loading
 
 
 class PylonCamera(LibraryCamera):
@@ -120,12 +118,7 @@ class PylonCamera(LibraryCamera):
         )
         self._controls.prepare()
         self._replay(features)
-        can = self._controls.capabilities()
-        if self._options.emulated:
-            exposure = can.exposure_us
-            whole = Range(exposure.min, exposure.max, _EMULATED_STEP_US, exposure.unit)
-            can = replace(can, exposure_us=whole)
-        return self._who(pylon, features), can, self._controls.read()
+        return self._who(pylon, features), self._controls.capabilities(), self._controls.read()
 
     @property
     def _device_class(self) -> str:

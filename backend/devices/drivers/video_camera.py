@@ -30,7 +30,7 @@ from backend.devices.errors import (
     UnsupportedFeature,
 )
 from backend.devices.found import FoundCamera
-from backend.devices.options import DeviceOptions, Size, read_options
+from backend.devices.options import DeviceOptions, Size, read_options, takes
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -75,12 +75,10 @@ class VideoOptions(DeviceOptions):
     """Other properties by OpenCV's names without CAP_PROP_, e.g. `{GAIN: 0, AUTO_WB: 0, FPS: 30}`."""
 
 
+@takes(VideoOptions)
 def create_camera(name: str, options: Mapping[str, Any]) -> "VideoCamera":
     """Make a camera of a rig file's entry."""
     return VideoCamera(name, read_options(VideoOptions, name, options))
-
-
-create_camera.options_model = VideoOptions  # type: ignore[attr-defined]  # read by driver_loading
 
 
 class VideoCamera(LibraryCamera):
