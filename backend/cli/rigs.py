@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from backend.cli.checking import check_rig
+from backend.cli.conforming import conform
 from backend.cli.discovering import discover
 from backend.cli.house import Monitor, open_services
 from backend.cli.options import AsJson, DataFolder
@@ -26,6 +27,7 @@ def register(application: typer.Typer) -> None:
     group.command("add")(add)
     group.command("remove")(remove)
     group.command("check")(check_rig)
+    group.command("conform")(conform)
     group.command("latency")(latency)
     group.command("discover")(discover)
     application.add_typer(group)
