@@ -29,6 +29,7 @@ from backend.jobs.journal import Journal, shot_document, shot_hash
 from backend.jobs.rendering import render
 from backend.jobs.shooting import Shooter, Take
 from backend.jobs.sync_checks import TRIES, SyncWatch
+from backend.jobs.sync_look import Violation
 from backend.jobs.sync_sets import Planned, Unit, Witness
 from backend.storage.artifacts import ArtifactStore, StoredPixels
 from backend.storage.rows import FrameRow
@@ -188,7 +189,12 @@ class CaptureSession:
             return {}
         cameras = {i: tuple(share.camera for share in shares) for i, shares in missing.items()}
         units = self._watch.units(burst, cameras)
-        self._load([planned.shot for unit in units for planned in unit.planned])
+        self._load(
+            [
+                *(planned.shot for unit in units for planned in unit.planned),
+                *self._watch.markers,
+            ]
+        )
         writes: list[Future[dict[int, dict[str, FrameRow]]]] = []
         most = 1 + (_MOST_UNWRITTEN - 1) // max(len(unit.planned) for unit in units)
         with ThreadPoolExecutor(1, thread_name_prefix="journal") as writer:
@@ -215,10 +221,12 @@ class CaptureSession:
                 waiting.extend(self.shooter.take_all(chunk))
                 done += len(chunk)
             frames = [waiting.popleft() for _ in unit.planned]
-            yield unit, self._right(unit, frames, burst)
+            yield self._right(unit, frames, burst)
 
-    def _right(self, unit: Unit, frames: Sequence[_Frames], burst: Burst) -> Sequence[_Frames]:
-        """Judge a unit's frames, and take them again if they aren't right.
+    def _right(
+        self, unit: Unit, frames: Sequence[_Frames], burst: Burst
+    ) -> tuple[Unit, Sequence[_Frames]]:
+        """Judge a unit's frames, and take them again if they aren't right; what was taken is returned.
 
         Raises
         ------
@@ -226,22 +234,24 @@ class CaptureSession:
             If they never are.
         """
         assert self.shooter is not None  # `_load` refused otherwise
+        first: Violation | None = None
         for attempt in range(1, TRIES + 1):
             violation = self._watch.judge(unit, frames, burst)
             if violation is None:
-                return frames
+                return unit, frames
+            first = first or violation
             if attempt == TRIES:
                 raise OutOfSync(
-                    violation.camera,
-                    f"{violation.sentence}, {TRIES} times in a row: the display is late, torn or not lit;"
-                    f" {self.shooter.way_out}",
+                    first.camera,
+                    f"{first.sentence}, and taken again it wasn't right in {TRIES} tries: the display is late, torn or"
+                    f" not lit; {self.shooter.way_out}",
                 )
             self.control.note(f"{violation.camera}: {violation.sentence}; taken again")
             log.warning(
                 "%s/%s, camera %s: %s; taken again",
                 self.scan, self.stage, violation.camera, violation.sentence,
             )  # fmt: skip
-            self._watch.findings.again += 1
+            unit = self._watch.again(unit)
             takes = [self._take_of(planned) for planned in unit.planned]
             chunks = self.shooter.chunks(takes)
             frames = [taken for chunk in chunks for taken in self.shooter.take_all(chunk)]

@@ -17,6 +17,7 @@ from backend.numerics.sync_checks import (
     FrameSample,
     black_light,
     common_part,
+    level,
     marker_light,
     pair_part,
     same,
@@ -51,6 +52,8 @@ class Known:
     """What sets of a family have in common, by family and camera; of one burst."""
     before: dict[str, FrameSample] = field(default_factory=dict)
     """The frame taken last, by camera."""
+    levels: dict[tuple[float, str], dict[float, float]] = field(default_factory=dict)
+    """Brightness of uniform fields by their code, by exposure and camera; of one burst."""
 
 
 @dataclass
@@ -101,12 +104,13 @@ class Look:
         self._samples = [sample_of(frame) for _, frame in own]
         self._of = {p.number: n for n, p in enumerate(self._planned) if p.number is not None}
         self.common: dict[tuple[Any, str], CommonPart] = {}
+        self.levels: dict[tuple[float, str], dict[float, float]] = {}
         self.last = self._samples[-1]
 
     def judge(self) -> Violation | None:
         """Return the first frame that isn't right, None if all are."""
         self._found.frames += len(self._samples)
-        return self._witnesses() or self._markers() or self._sets()
+        return self._witnesses() or self._unseen_fields() or self._markers() or self._sets()
 
     # uniform fields
 
@@ -119,6 +123,20 @@ class Look:
             if Fields(b, a, exposure).seen:
                 return self._violation("the white field is darker than the black one")
             self._known.fields[self._camera] = Fields(a, b, exposure)
+        return None
+
+    def _unseen_fields(self) -> Violation | None:
+        """See whether anything is brighter than white was, or darker than black: then those came too late."""
+        fields = self._known.fields.get(self._camera)
+        if fields is None or fields.seen:
+            return None
+        for planned, sample in zip(self._planned, self._samples, strict=True):
+            exposure = exposure_of(planned.shot)
+            name = "the marker" if planned.number is None else self._named(planned.number)
+            if Fields(sample, fields.at_most(exposure), exposure).seen:
+                return self._violation(f"{name} is brighter than the white field")
+            if Fields(fields.at_least(exposure), sample, exposure).seen:
+                return self._violation(f"{name} is darker than the black field")
         return None
 
     def _markers(self) -> Violation | None:
@@ -172,6 +190,9 @@ class Look:
     def _set(self, one: FrameSet) -> Violation | None:
         places = [self._of[number] for number in one.numbers]
         samples = [self._samples[n] for n in places]
+        disorder = self._disorder(one, samples[-1])
+        if disorder is not None:
+            return disorder
         if one.kind in (SetKind.WHITE, SetKind.BLACK):
             return self._uniform(one, samples[0])
         before = self._known.before.get(self._camera)
@@ -211,6 +232,34 @@ class Look:
             self.common[key] = part
             return None
         return part.against(known, before)
+
+    def _disorder(self, one: FrameSet, sample: FrameSample) -> Violation | None:
+        """See whether a brighter code is darker than another one, at one exposure: whatever the display's gamma is."""
+        shot, fields = self._burst[one.numbers[-1]], self._known.fields.get(self._camera)
+        if not isinstance(shot.pattern, Uniform) or shot.mask is not None or fields is None:
+            return None
+        exposure, code = exposure_of(shot), shot.pattern.gray
+        key = (exposure, self._camera)
+        known = dict(self.levels.get(key) or self._known.levels.get(key, {}))
+        if exposure == fields.exposure:
+            known |= {
+                255.0: level(fields.white, fields) or 0.0,
+                0.0: level(fields.black, fields) or 0.0,
+            }
+        here = level(sample, fields)
+        if here is None:
+            return None
+        slack = MARKER_LIMIT * (max([here, *known.values()]) - min([here, *known.values()]))
+        for other, brightness in known.items():
+            if (other - code) * (brightness - here) < 0 and abs(brightness - here) > max(
+                slack, 1.0
+            ):
+                return self._violation(
+                    f"{self._named(one.numbers[-1])} is {'brighter' if here > brightness else 'darker'} than gray"
+                    f" {other:g}"
+                )
+        self.levels[key] = known | {code: here}
+        return None
 
     def _uniform(self, one: FrameSet, sample: FrameSample) -> Violation | None:
         fields = self._known.fields.get(self._camera)

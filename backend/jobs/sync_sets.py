@@ -119,7 +119,7 @@ def units_of(
         What is exposed before everything else.
     """
     sets = sets_of(burst, cameras)
-    place = random.Random(seed).randint(0, min(len(cameras), _EARLY))  # noqa: S311  nobody is to be kept from guessing it
+    place = _place(seed, len(cameras))
     units: list[Unit] = []
     joined: list[FrameSet] = []
     compared: set[Hashable] = set()
@@ -132,8 +132,24 @@ def units_of(
         compared |= {s.family for s in joined}
         joined = []
     if units:
-        units[0] = _marked(units[0], burst, place, tuple(first))
+        units[0] = _marked(units[0], place, tuple(first))
     return units
+
+
+def marked_again(unit: Unit, *, seed: str) -> Unit:
+    """Put one more marker into a unit, to take it again.
+
+    A display that is late by one pattern shows the last step of the first try as the first step of the second, and so
+    on: a set that fits, with every phase wrong.
+    """
+    shots = sum(p.number is not None for p in unit.planned)
+    return _marked(unit, _place(seed, shots), ())
+
+
+def _place(seed: str, shots: int) -> int:
+    """Return before which shot the marker comes."""
+    # Nobody has to be kept from guessing it: a display doesn't try.
+    return random.Random(seed).randint(0, min(shots, _EARLY))  # noqa: S311  not for secrets
 
 
 def _lacks_partner(
@@ -151,10 +167,12 @@ def _unit(
     return Unit(tuple(Planned(burst[n], cameras[n], n) for n in numbers), tuple(sets))
 
 
-def _marked(unit: Unit, burst: Sequence[Shot], place: int, first: tuple[Planned, ...]) -> Unit:
+def _marked(unit: Unit, place: int, first: tuple[Planned, ...]) -> Unit:
     planned = unit.planned
-    beside = planned[min(place, len(planned) - 1)]
-    dark = all(_is_dark(p.shot.pattern) for p in planned)
+    asked = [n for n, p in enumerate(planned) if p.number is not None]
+    beside = planned[asked[min(place, len(asked) - 1)]]
+    at = asked[place] if place < len(asked) else len(planned)
+    dark = all(_is_dark(planned[n].shot.pattern) for n in asked)
     shot = Shot(
         WHITE if dark else BLACK,
         beside.shot.exposure_ms,
@@ -162,7 +180,7 @@ def _marked(unit: Unit, burst: Sequence[Shot], place: int, first: tuple[Planned,
         role="marker",
     )
     marker = Planned(shot, beside.cameras, witness=Witness.MARKER)
-    return Unit((*first, *planned[:place], marker, *planned[place:]), unit.sets)
+    return Unit((*first, *planned[:at], marker, *planned[at:]), unit.sets)
 
 
 def _is_dark(pattern: Pattern) -> bool:

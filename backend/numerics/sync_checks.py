@@ -6,9 +6,12 @@ noise, whatever the camera's; and it is compared with the light that the set mov
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Integer
 
@@ -17,6 +20,8 @@ MOST_ROW_PAIRS = 96
 BANDS = 8
 """Parts of the picture that are judged by themselves, from top to bottom: a torn frame is wrong in some of them."""
 _LEAST_PIXELS = 200
+_LEAST_VALID = 0.2
+"""Share of the picture below which the rest isn't judged: what little isn't saturated sees what spills over."""
 _LEAST_SHARE = 0.02
 """A band with less than this share of the light isn't judged."""
 _LEAST_MODULATION = 1.5 / 255
@@ -55,10 +60,9 @@ class FrameSample:
         count = min(height_px // 2, MOST_ROW_PAIRS)
         first = (np.arange(count) * (height_px // 2) // max(count, 1)) * 2
         rows = np.stack([first, first + 1], axis=1)
-        raw = gray[rows]
-        self.gray: Sample = raw.astype(np.float32)
+        self.gray: Sample = gray[rows].astype(np.float32)
         self.full_scale_gray = full_scale_gray
-        self.valid: Valid = ~_widened(raw >= full_scale_gray - 1)
+        self.valid: Valid = ~_spoilt(gray, full_scale_gray)[rows]
 
 
 def step_set(
@@ -157,25 +161,43 @@ class Fields:
     exposure: float
     """Exposure times gain, in any unit."""
 
-    @property
+    @cached_property
     def lit(self) -> Valid:
-        """Pixels that tell white from black clearly.
+        """Pixels that tell white from black clearly; none where the camera doesn't see the projector.
 
-        By what their neighbours tell: a pixel that were chosen for its own noise would be darker the next time.
+        By what their neighbours tell: a pixel that was chosen for its own noise would be darker the next time. And
+        noise that looks like light to one of two neighbours doesn't to the other.
         """
-        light = (self.white.gray - self.black.gray)[:, ::-1]
-        top = float(np.quantile(light, 0.99))
-        least = max(0.25 * top, 4 * _LEAST_MODULATION * self.white.full_scale_gray)
-        return np.asarray(light > least)
+        light = self.white.gray - self.black.gray
+        least = 4 * _LEAST_MODULATION * self.white.full_scale_gray
+        beside = light[:, ::-1]
+        lit = np.asarray(beside > max(0.25 * float(np.quantile(light, 0.99)), least))
+        if np.count_nonzero(lit) < _LEAST_PIXELS or float(light[lit].mean()) < least:
+            return np.zeros_like(lit)
+        return lit
 
     @property
     def seen(self) -> bool:
         """Whether the camera sees the projector at all."""
-        return int(np.count_nonzero(self.lit)) >= _LEAST_PIXELS
+        return bool(self.lit.any())
 
     def darkest(self, exposure: float) -> Sample:
         """Return what a black field may read at most at another exposure, whatever the camera's black level is."""
         return np.asarray(self.black.gray * np.float32(max(1.0, exposure / self.exposure)))
+
+    def at_most(self, exposure: float) -> FrameSample:
+        """Return what any frame may read at most at another exposure if white was white."""
+        brightest = copy(self.white)
+        higher = np.maximum(self.white.gray, self.black.gray)
+        brightest.gray = higher * np.float32(max(1.0, exposure / self.exposure))
+        return brightest
+
+    def at_least(self, exposure: float) -> FrameSample:
+        """Return what any frame reads at least at another exposure if black was black."""
+        darkest = copy(self.black)
+        lower = np.minimum(self.white.gray, self.black.gray)
+        darkest.gray = lower * np.float32(min(1.0, exposure / self.exposure))
+        return darkest
 
     def brightness(self, exposure: float) -> Sample:
         """Return about how far white is above black at another exposure."""
@@ -205,7 +227,7 @@ def marker_light(
     The black level of the camera needn't be known: black is allowed whatever it may read at this exposure.
     """
     lit, darkest = fields.lit, fields.darkest(exposure)
-    if int(np.count_nonzero(lit)) < _LEAST_PIXELS:
+    if not fields.seen:
         return None
     above = [float((f.gray - darkest)[lit].mean()) for f in (marker, *others)]
     brightest = max(above)
@@ -227,13 +249,18 @@ def black_light(frame: FrameSample, fields: Fields, exposure: float) -> float | 
 def white_light(marker: FrameSample, fields: Fields, exposure: float) -> float | None:
     """Return which share of white a frame has that should be white; None where the camera doesn't see the projector."""
     lit = fields.lit
-    if int(np.count_nonzero(lit)) < _LEAST_PIXELS:
+    if not fields.seen:
         return None
     white = float(fields.brightness(exposure)[lit].mean())
     dark = fields.black.gray * np.float32(min(1.0, exposure / fields.exposure))
     if white < _LEAST_MODULATION * marker.full_scale_gray:
         return None
     return float((marker.gray - dark)[lit].mean()) / white
+
+
+def level(frame: FrameSample, fields: Fields) -> float | None:
+    """Return how bright a frame is where the projector's light falls, in [gray]; None where it isn't seen."""
+    return float(frame.gray[fields.lit].mean()) if fields.seen else None
 
 
 def drift(before: FrameSample, after: FrameSample, fields: Fields) -> float | None:
@@ -289,6 +316,8 @@ def _judged(
     full = frames[0].full_scale_gray if frames else 255.0
     if light.energy < (_LEAST_MODULATION * full) ** 2 / 2:
         return None
+    if counts[0] < _LEAST_VALID * light.valid.size:
+        return None
     found = np.stack([_by_band(sums).max(axis=1) for sums in _row_sums(deviations, light.valid)])
     found /= np.maximum(counts, 1)
     squares = float((deviations**2 * light.valid).sum(dtype=np.float64)) / len(deviations)
@@ -343,13 +372,10 @@ def _all_valid(frames: Sequence[FrameSample]) -> Valid:
     return np.asarray(np.logical_and.reduce([f.valid for f in frames]))
 
 
-def _widened(saturated: Bool[np.ndarray, "pair 2 w"]) -> Valid:
-    """Take the neighbours in: charge spills over, and lenses blur."""
-    wide: Any = saturated.any(axis=1, keepdims=True)
-    for shift in (1, 2):
-        wide[..., shift:] |= wide[..., :-shift].copy()
-        wide[..., :-shift] |= wide[..., shift:].copy()
-    return np.array(np.broadcast_to(wide, saturated.shape))
+def _spoilt(gray: Gray, full_scale_gray: float) -> Bool[np.ndarray, "h w"]:
+    """Return what is saturated, and its neighbours: charge spills over, most of all along columns, and lenses blur."""
+    saturated = (gray >= full_scale_gray - 1).astype(np.uint8)
+    return np.asarray(cv2.dilate(saturated, np.ones((21, 5), np.uint8)) > 0)
 
 
 def _design(shifts_rad: Float[np.ndarray, "n"]) -> tuple[Any, Any]:
