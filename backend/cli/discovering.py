@@ -73,16 +73,20 @@ def _show(found: "tuple[FoundCamera, ...]") -> None:
     if not found:
         console().print("no cameras found")
         return
-    rows = table("camera", "at", "controlled by", "used in", "line for a rig file")
-    for camera in found:
+    rows = table("", "camera", "at", "controlled by", "used in")
+    for number, camera in enumerate(found, 1):
         rows.add_row(
+            f"camera{number}",
             _who(camera),
             camera.address or "-",
             {None: "not known", "": "nobody"}.get(camera.controlled_by, camera.controlled_by),
             ", ".join(camera.used_in) or "-",
-            camera.rig_line,
         )
-    console().print(rows)
+    out = console()
+    out.print(rows)
+    out.print("for a rig file, with names of your choice:\ncameras:")
+    for number, camera in enumerate(found, 1):
+        out.print(f"  camera{number}: {camera.rig_line}", markup=False)
 
 
 def _who(camera: "FoundCamera") -> str:

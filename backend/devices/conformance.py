@@ -44,6 +44,8 @@ from backend.devices.protocols import (
 )
 from backend.domain.errors import UnglareError
 
+_UNTOLD_STEP_US = 1.0
+"""Many cameras take whole microseconds without saying so."""
 _UNWIRED = {TriggerSource.SOFTWARE, TriggerSource.FREE_RUN}
 
 
@@ -129,7 +131,7 @@ class RigConformance:
             wanted = 0.25 * allowed.min + 0.75 * min(allowed.max, max(allowed.min, 100_000.0))
             taken = camera.configure(replace(camera.settings, exposure_us=wanted))
             assert taken == camera.settings
-            assert abs(taken.exposure_us - wanted) <= max(allowed.inc, 1e-6 * wanted)
+            assert abs(taken.exposure_us - wanted) <= max(allowed.inc, _UNTOLD_STEP_US)
             assert taken.pixel_format in camera.capabilities.pixel_formats
 
     def test_none_keeps_the_pixel_format(self, rig: Rig) -> None:
@@ -174,12 +176,17 @@ class RigConformance:
     # ------------------------------------------------------------ frames
 
     def test_ten_frames_count_up(self, rig: Rig) -> None:
-        """Ten triggers give ten consecutive ids, times that don't run back, the settings read back."""
+        """Ten triggers give ten consecutive ids, times that don't run back, the settings read back.
+
+        A camera that runs freely doesn't wait for whoever fetches: frames may be lost, and their ids with them.
+        """
         camera = _first(rig)
         with _armed(rig):
             frames = [_shot(camera) for _ in range(10)]
         ids = [frame.frame_id for frame in frames]
-        assert ids == list(range(ids[0], ids[0] + 10))
+        assert ids == sorted(set(ids))
+        if camera.settings.trigger is TriggerSource.SOFTWARE:
+            assert ids == list(range(ids[0], ids[0] + 10))
         hosts = [frame.host_time_s for frame in frames]
         assert hosts == sorted(hosts)
         assert all(frame.exposure_us == camera.settings.exposure_us for frame in frames)

@@ -1,5 +1,6 @@
 """One conformance suite over every camera driver that can run here, and what each has besides."""
 
+import ctypes
 import sys
 import threading
 import time
@@ -173,6 +174,40 @@ def test_a_pylon_camera_that_is_not_there_is_one_sentence(options, sentence):
     with pytest.raises(DeviceNotFound, match=sentence) as caught:
         make_camera("left", "pylon", options).open()
     assert "\n" not in str(caught.value)
+
+
+# ---------------------------------------------------------------- Aravis
+
+
+@pytest.mark.xdist_group("aravis-fake-camera")
+class TestAravisOnItsOwnFakeCamera(RigConformance):
+    """Somebody else's GigE Vision camera: old names of features, frame numbers that wrap, light of its own."""
+
+    exposure_us = 10_000.0
+
+    @pytest.fixture
+    def rig(self) -> Iterator[AssembledRig]:
+        with fake_camera("127.0.0.1"):
+            options = {"left": {"address": "127.0.0.1", "region": [0, 0, 128, 96]}}
+            with bench(cameras_of("aravis", options)) as rig:
+                yield rig
+
+
+@contextmanager
+def fake_camera(address: str) -> Iterator[None]:
+    """Run the camera that comes with Aravis in threads of its own."""
+    try:
+        library = ctypes.CDLL(aravis_library.LIBRARY)
+    except OSError as error:
+        pytest.skip(str(error))
+    library.arv_gv_fake_camera_new.restype = ctypes.c_void_p
+    camera = ctypes.c_void_p(library.arv_gv_fake_camera_new(address.encode(), b"FAKE1"))
+    try:
+        if not library.arv_gv_fake_camera_is_running(camera):
+            pytest.skip(f"another program has the GigE Vision port of {address}")
+        yield
+    finally:
+        library.g_object_unref(camera)
 
 
 # ---------------------------------------------------------------- GenTL

@@ -117,6 +117,9 @@ def answer(to: Request, payload: bytes, status: Status = Status.SUCCESS) -> byte
     return _ANSWER.pack(status, to.command + 1, len(payload), to.request_id) + payload
 
 
+_ROUNDS = 2
+
+
 @dataclass(frozen=True)
 class Found:
     """A device that answered."""
@@ -139,15 +142,17 @@ def ask(addresses: Sequence[str], *, timeout_s: float = 0.3) -> tuple[Found, ...
         How long to wait for the slowest, in [s].
     """
     found: dict[str, Found] = {}
+    waiting_for = set(addresses)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        waiting_for = {a for a in addresses if _sent(asking, request(Command.DISCOVERY), a)}
-        deadline_s = time.monotonic() + timeout_s
-        while waiting_for and (came := _received(asking, deadline_s)):
-            data, address = came
-            device = _found(address, data)
-            if device and address in waiting_for:
-                found[address] = device
-                waiting_for.discard(address)
+        for _ in range(_ROUNDS):  # a datagram may get lost
+            waiting_for = {a for a in waiting_for if _sent(asking, request(Command.DISCOVERY), a)}
+            deadline_s = time.monotonic() + timeout_s / _ROUNDS
+            while waiting_for and (came := _received(asking, deadline_s)):
+                data, address = came
+                device = _found(address, data)
+                if device and address in waiting_for:
+                    found[address] = device
+                    waiting_for.discard(address)
     return tuple(found[a] for a in dict.fromkeys(addresses) if a in found)
 
 
@@ -156,12 +161,15 @@ def read_register(address: str, register: int, *, timeout_s: float = 0.3) -> int
 
     Reading needs no control, so a camera that somebody uses isn't disturbed.
     """
+    question = request(Command.READ_REGISTER, register.to_bytes(4))
+    came = None
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        question = request(Command.READ_REGISTER, register.to_bytes(4))
-        came = _sent(asking, question, address) and _received(asking, time.monotonic() + timeout_s)
-        if not came:
-            return None
-        data, _ = came
+        for _ in range(_ROUNDS):
+            if came is None and _sent(asking, question, address):
+                came = _received(asking, time.monotonic() + timeout_s / _ROUNDS)
+    if came is None:
+        return None
+    data, _ = came
     status, command, _length, _id = _ANSWER.unpack_from(data.ljust(_ANSWER.size, b"\0"))
     if command != Command.READ_REGISTER + 1:
         return None
