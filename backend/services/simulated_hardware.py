@@ -113,6 +113,8 @@ class SimulatedHardware:
             peers.append(PeerProcess(peer, light))
             stack.callback(peers[-1].stop)
         for process in peers:
+            stack.callback(process.tell_end)  # all of them end at once, then they are waited for
+        for process in peers:
             process.wait_until_ready()
         return peers
 

@@ -99,9 +99,13 @@ class PeerProcess:
         self._process.kill()
         self._process.join()
 
+    def tell_end(self) -> None:
+        """Have it end, without waiting for that."""
+        self._told.close()
+
     def stop(self) -> None:
         """Take the camera off the network; any number of times."""
-        self._told.close()
+        self.tell_end()
         self._process.join(_END_S)
         if self._process.is_alive():
             self._process.kill()

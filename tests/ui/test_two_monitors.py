@@ -1,0 +1,279 @@
+"""The whole application on two monitors: server, kiosk and GigE Vision cameras that see what the second one shows."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Page, Playwright
+
+from backend.devices.drivers.aravis_library import AravisMissingError, aravis
+from backend.devices.peers.monitor_display import Screen
+from backend.devices.sim.config import SimulatedRigConfig
+from backend.devices.sim.rig import SimulatedRig
+from tests.ui.test_projector_page import patterns
+from tests.ui.two_monitors import (
+    SIZE,
+    Desktop,
+    Program,
+    Scan,
+    Station,
+    two_monitors,
+    wait_for,
+)
+
+try:
+    aravis()
+except AravisMissingError as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+pytestmark = pytest.mark.ui
+
+WORLD: dict[str, Any] = {"scene": "plane", "size": "320x240", "seed": 5}
+CAMERAS = ("127.78.0.2", "127.78.0.3")
+LATE_CAMERAS = ("127.78.0.4", "127.78.0.5")
+MOST_COLUMN_ERROR_PX = 0.02
+BRIEF: dict[str, dict[str, Any]] = {"exposures": {"exposures_ms": [50.0]}}
+"""One exposure: 12 shots."""
+
+
+@pytest.fixture(scope="module")
+def desktop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desktop]:
+    with two_monitors(tmp_path_factory.mktemp("desktop")) as running:
+        yield running
+
+
+def simulate(desktop: Desktop, name: str, addresses: tuple[str, str], *more: str) -> Program:
+    """Start `unglare simulate-hardware`; its rig file is NAME.yaml."""
+    options = [f"--{key}={value}" for key, value in WORLD.items()]
+    options += [f"--address={address}" for address in addresses]
+    file = desktop.folder / f"{name}.yaml"
+    return desktop.unglare(
+        f"simulate-{name}", "simulate-hardware", f"--write-rig={file}", *options, *more
+    )
+
+
+@contextmanager
+def simulated(
+    desktop: Desktop, station: Station, name: str, addresses: tuple[str, str], *more: str
+) -> Iterator[Program]:
+    program = simulate(desktop, name, addresses, *more)
+    program.wait_until_it_says("Stop with Ctrl")
+    station.add_rig(desktop.folder / f"{name}.yaml", name)
+    yield program
+    assert program.stop(signal.SIGINT) == 0, program.said
+
+
+@pytest.fixture(scope="module")
+def station(desktop: Desktop) -> Iterator[Station]:
+    with closing(Station(desktop, desktop.folder / "data")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def hardware(desktop: Desktop, station: Station) -> Iterator[Program]:
+    with simulated(desktop, station, "room", CAMERAS) as running:
+        yield running
+
+
+@dataclass
+class Window:
+    """The kiosk, and its page by DevTools."""
+
+    program: Program
+    page: Page
+
+    def command(self, name: str, **parameters: Any) -> Any:
+        """Ask something of DevTools."""
+        return self.page.context.new_cdp_session(self.page).send(name, parameters)
+
+
+@contextmanager
+def opened_window(desktop: Desktop, station: Station, playwright: Playwright) -> Iterator[Window]:
+    program, tools = station.open_page(desktop.folder / "kiosk")
+    browser = playwright.chromium.connect_over_cdp(tools)
+    page = next(p for p in browser.contexts[0].pages if "/projector" in p.url)
+    page.get_by_text("waiting for patterns").wait_for()
+    page.wait_for_function(
+        "([left, width, height]) => screenX === left && innerWidth === width && innerHeight === height",
+        arg=[SIZE[0], *SIZE],
+    )
+    yield Window(program, page)
+    browser.close()
+    program.stop()
+
+
+@pytest.fixture
+def window(desktop: Desktop, station: Station, playwright: Playwright) -> Iterator[Window]:
+    """Return a kiosk of the test's own: many of them end badly."""
+    with opened_window(desktop, station, playwright) as opened:
+        yield opened
+
+
+def column_error_px(scan: Scan, camera: str = "left") -> float:
+    """Compare the measured projector column with where the rig's exact geometry puts it, rms over good pixels."""
+    rig = SimulatedRig(
+        SimulatedRigConfig.model_validate({**WORLD, "projector_size": f"{SIZE[0]}x{SIZE[1]}"})
+    )
+    calibration, truth = rig.calibration(), rig.truth(camera)
+    assert calibration is not None
+    assert calibration.projector is not None
+    assert calibration.projector_from_world is not None
+    pose, camera_pose = calibration.projector_from_world, calibration.camera_from_world[camera]
+    points = (truth.points_mm.reshape(-1, 3) - camera_pose.t_mm) @ camera_pose.R
+    rotation, _ = cv2.Rodrigues(pose.R)
+    model = calibration.projector
+    pixels, _ = cv2.projectPoints(points, rotation, pose.t_mm, model.K, model.distortion)
+    exact = pixels[:, 0, 0].reshape(truth.points_mm.shape[:2])
+    measured = scan.array("fringe_phase", "projector_px", camera)
+    good = truth.lit_and_seen & ~truth.edge_band & np.isfinite(measured)
+    assert good.mean() > 0.5
+    return float(np.sqrt(np.mean((measured - exact)[good] ** 2)))
+
+
+def has_good_columns(scan: Scan) -> bool:
+    assert scan.end()["error"] is None
+    return all(
+        column_error_px(scan, camera) <= MOST_COLUMN_ERROR_PX for camera in ("left", "right")
+    )
+
+
+def test_an_unattended_scan_with_real_protocols_is_as_good_as_its_noise(
+    hardware: Program, window: Window, station: Station
+) -> None:
+    scan = station.scan("room", exposures={"steps": 8}).start()
+    assert has_good_columns(scan)
+    points = next(c for c in scan.stage("stereo_cloud")["checks"] if c["name"] == "points")
+    assert points["value"] > 30_000
+
+
+def test_injected_lag_is_found_and_the_scan_is_as_good(
+    desktop: Desktop, window: Window, station: Station
+) -> None:
+    with simulated(desktop, station, "late", LATE_CAMERAS, "--lag-ms=60"):
+        station.post("/api/rigs/late/latency", repetitions=3)
+        wait_for(lambda: station.get("/api/rigs/late/latency"), "the latency calibration")
+        found = station.get("/api/rigs/late/latency")
+        assert found["kept"], found["note"]
+        assert 60.0 <= found["settle_ms"] <= 110.0  # with the frame period that is added for safety
+        assert has_good_columns(station.scan("late", exposures={"steps": 8}).start())
+
+
+def test_without_settling_the_checks_refuse_a_lagging_projector(
+    desktop: Desktop, window: Window, station: Station
+) -> None:
+    with simulated(desktop, station, "hasty", LATE_CAMERAS, "--lag-ms=60"):
+        file = desktop.folder / "hasty.yaml"
+        file.write_text(file.read_text().replace("  gamma:", "  settle_ms: 0.0\n  gamma:"))
+        station.add_rig(file, "hurried")
+        error = station.scan("hurried", **BRIEF).start().end()["error"]
+        assert error is not None
+        assert "settle" in error or "pattern" in error
+
+
+def test_every_pixel_of_the_second_monitor_is_as_asked(
+    desktop: Desktop, hardware: Program, window: Window, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page's own drawing, read back from the X server; other device pixel ratios: test_projector_page."""
+    monkeypatch.setenv("DISPLAY", desktop.display)
+    with closing(Screen(desktop.region)) as screen:
+        for pattern in patterns(*SIZE):
+            window.page.evaluate(
+                """([w, h, gray]) => { receive({data: JSON.stringify({t: "load", slot: 0, w, h})});
+                   receive({data: new Uint8Array(gray).buffer}); show({id: 1, slot: 0}); }""",
+                [*SIZE, pattern.ravel().tolist()],
+            )
+            wait_for(lambda p=pattern: np.array_equal(screen.gray(), p), "the pattern", 20.0)
+
+
+@pytest.mark.parametrize("shot", [4])
+def test_a_camera_that_is_killed_in_mid_scan_and_comes_back(
+    desktop: Desktop, station: Station, window: Window, shot: int
+) -> None:
+    program = simulate(desktop, "frail", LATE_CAMERAS)
+    program.wait_until_it_says("Stop with Ctrl")
+    station.add_rig(desktop.folder / "frail.yaml", "frail")
+    scan = station.scan("frail", **BRIEF).start("fringe_capture")
+    scan.wait_for_shot(shot)
+    program.stop(signal.SIGKILL)
+    program = simulate(desktop, "frail", LATE_CAMERAS)
+    program.wait_until_it_says("Stop with Ctrl")
+    ends_or_goes_on(scan)
+    program.stop()
+
+
+def ends_or_goes_on(scan: Scan) -> None:
+    """Check that a disturbed scan went on, or ended with one sentence and goes on when told to; nothing is lost."""
+    error = scan.end()["error"]
+    if error is not None:
+        assert "\n" not in error
+        assert "kept" in error
+        assert scan.start("fringe_capture").end()["error"] is None
+    assert len(scan.frames()) == 24
+
+
+def reload(window: Window, desktop: Desktop) -> None:
+    window.page.reload()
+
+
+def freeze(window: Window, desktop: Desktop) -> None:
+    window.page.evaluate(
+        "() => { setTimeout(() => { const end = Date.now() + 3000; while (Date.now() < end); }, 0) }"
+    )
+
+
+def zoom_and_back(window: Window, desktop: Desktop) -> None:
+    window.command("Emulation.setPageScaleFactor", pageScaleFactor=1.5)
+    window.page.wait_for_timeout(500)
+    window.command("Emulation.setPageScaleFactor", pageScaleFactor=1.0)
+
+
+def shrink_and_back(window: Window, desktop: Desktop) -> None:
+    number = window.command("Browser.getWindowForTarget")["windowId"]
+    window.command("Browser.setWindowBounds", windowId=number, bounds={"windowState": "normal"})
+    window.page.wait_for_timeout(500)
+    window.command("Browser.setWindowBounds", windowId=number, bounds={"windowState": "fullscreen"})
+
+
+def pull_the_cable_and_plug_in(window: Window, desktop: Desktop) -> None:
+    desktop.unplug()
+    window.page.wait_for_timeout(500)
+    desktop.plug_in()
+    number = window.command("Browser.getWindowForTarget")["windowId"]
+    window.command("Browser.setWindowBounds", windowId=number, bounds={"windowState": "normal"})
+    bounds = {"left": SIZE[0], "top": 0, "width": SIZE[0], "height": SIZE[1]}
+    window.command("Browser.setWindowBounds", windowId=number, bounds=bounds)
+    window.command("Browser.setWindowBounds", windowId=number, bounds={"windowState": "fullscreen"})
+
+
+@pytest.mark.parametrize(
+    "disturb",
+    [reload, freeze, zoom_and_back, shrink_and_back, pull_the_cable_and_plug_in],
+    ids=lambda d: d.__name__,
+)
+def test_a_page_disturbed_in_mid_scan(
+    disturb: Any, desktop: Desktop, hardware: Program, station: Station, window: Window
+) -> None:
+    scan = station.scan("room", **BRIEF).start("fringe_capture")
+    scan.wait_for_shot(4)
+    disturb(window, desktop)
+    window.page.wait_for_function(
+        "([left, width, height]) => screenX === left && innerWidth === width && innerHeight === height",
+        arg=[SIZE[0], *SIZE],
+    )
+    ends_or_goes_on(scan)
+
+
+def test_a_page_closed_in_mid_scan_and_opened_again(
+    desktop: Desktop, hardware: Program, station: Station, playwright: Playwright
+) -> None:
+    with opened_window(desktop, station, playwright) as window:
+        scan = station.scan("room", **BRIEF).start("fringe_capture")
+        scan.wait_for_shot(4)
+        window.page.close()
+    with opened_window(desktop, station, playwright):
+        ends_or_goes_on(scan)
