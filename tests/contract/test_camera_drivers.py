@@ -45,7 +45,7 @@ def bench(cameras: dict[str, Camera]) -> AssembledRig:
     return AssembledRig("bench", cameras, display, sensors=sensors)
 
 
-def cameras_of(driver: str, options: dict[str, dict[str, object]]) -> dict[str, Camera]:
+def cameras_of(driver: str, options: Mapping[str, Mapping[str, object]]) -> dict[str, Camera]:
     return {name: make_camera(name, driver, given) for name, given in options.items()}
 
 
@@ -164,7 +164,7 @@ def test_options_that_contradict_each_other_are_refused(options, sentence):
     ("options", "sentence"),
     [
         ({"address": "127.77.1.9"}, "no camera answers at 127.77.1.9 .*check cable"),
-        ({"serial": 123}, "no camera answers at serial number 123 .*check cable"),
+        ({"serial": 123}, "no camera answers with serial number 123 .*check cable"),
         ({"serial": "0815-9999", "emulated": True}, "serial number 0815-9999 .*PYLON_CAMEMU"),
     ],
 )
@@ -670,6 +670,15 @@ def test_a_missing_library_is_one_sentence_with_the_command(
     finally:
         aravis_library.aravis.cache_clear()
     assert "\n" not in str(caught.value)
+
+
+def test_an_usb_camera_that_is_not_there_is_looked_for_on_usb_only():
+    try:
+        aravis_library.aravis()
+    except aravis_library.AravisMissingError as error:
+        pytest.skip(str(error))
+    with pytest.raises(DeviceNotFound, match="left: no camera answers with serial number 7; check"):
+        make_camera("left", "aravis", {"serial": 7}).open()
 
 
 def test_every_driver_says_which_options_it_takes():

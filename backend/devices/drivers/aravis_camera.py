@@ -142,13 +142,14 @@ class AravisCamera(LibraryCamera):
         return int(camera)
 
     def _not_opened(self, error: AravisError | None) -> DeviceError:
-        where = self._options.address or f"serial number {self._options.serial}"
+        address, serial = self._options.address, self._options.serial
+        where = f"at {address}" if address else f"with serial number {serial}"
         if error is not None and error.is_refused_access:
             return DeviceBusy(
-                self.name, f"another program controls the camera at {where}; close it there"
+                self.name, f"another program controls the camera {where}; close it there"
             )
         return DeviceNotFound(
-            self.name, f"no camera answers at {where}; check cable, power and the rig's file"
+            self.name, f"no camera answers {where}; check cable, power and the rig's file"
         )
 
     def _note_loss(self) -> None:

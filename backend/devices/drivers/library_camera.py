@@ -210,6 +210,7 @@ class LibraryCamera(Link):
         refuse_trigger(self.name, self._settings, armed=self._state is LinkState.ARMED)
         self._aborted.wait(max(0.0, self._free_at_s - time.monotonic()))
         with self._calling, self._doing("the trigger"):
+            self._refuse_waiting()  # acquisition may have been aborted meanwhile
             self._wait_until_ready()
             self._fire()
         self._due_at_s = time.monotonic() + self._settings.exposure_us * 1e-6

@@ -141,16 +141,18 @@ class PylonCamera(LibraryCamera):
 
     def _not_opened(self, error: Exception) -> DeviceError:
         options = self._options
-        where = options.address or f"serial number {options.serial}"
+        where = (
+            f"at {options.address}" if options.address else f"with serial number {options.serial}"
+        )
         if _CONTROLLED in str(error):
             return DeviceBusy(
-                self.name, f"another program controls the camera at {where}; close it there"
+                self.name, f"another program controls the camera {where}; close it there"
             )
         cure = "check cable, power and the rig's file"
         if options.emulated:
             cure = f"set {_EMULATED_COUNT} to a number of cameras before the program starts"
         return DeviceNotFound(
-            self.name, f"no camera answers at {where} (pylon: {_first_part(error)}); {cure}"
+            self.name, f"no camera answers {where} (pylon: {_first_part(error)}); {cure}"
         )
 
     def _disconnect(self) -> None:
