@@ -59,6 +59,8 @@ class LibraryCamera(Link):
         self._settings = CameraSettings(0.0)
         self._wanted: CameraSettings | None = None
         self._aborted = threading.Event()
+        self._given_up = threading.Event()
+        """Whoever waits for the camera to come back waits no longer."""
         self._calling = threading.RLock()
         """Held during every call of the library: `abort` may come from any thread."""
         self._free_at_s = 0.0
@@ -139,17 +141,17 @@ class LibraryCamera(Link):
         wanted = self._wanted
         patience_s = max(timeout_s, 2 * HEARTBEAT_S)
         deadline_s = time.monotonic() + patience_s
+        self._given_up.clear()
         while True:
             self.close()
             try:
                 self.open()
                 break
             except (DeviceBusy, DeviceNotFound, DeviceTimeout, DeviceDisconnected) as error:
-                if time.monotonic() > deadline_s:
+                if time.monotonic() > deadline_s or self._given_up.wait(0.25):
                     raise self._lose(
                         f"doesn't come back within {patience_s:g} s ({error})"
                     ) from error
-                time.sleep(0.25)
         if wanted is not None:
             self.configure(wanted)
 
@@ -293,6 +295,7 @@ class LibraryCamera(Link):
 
     def abort(self) -> None:
         """Stop waiting; thread-safe. If the library doesn't return, acquisition ends when the camera is armed next."""
+        self._given_up.set()
         self._aborted.set()
         if self._calling.acquire(timeout=_PATIENCE_S):
             try:
