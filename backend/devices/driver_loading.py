@@ -12,7 +12,14 @@ from typing import Any
 
 from backend.devices.errors import RigConfigError
 from backend.devices.pages import PageDesk
-from backend.devices.plug_ins import call_plug_in, lacking, load_plug_in, package_of, plug_ins
+from backend.devices.plug_ins import (
+    IMPORT_S,
+    call_plug_in,
+    lacking,
+    load_plug_in,
+    package_of,
+    plug_ins,
+)
 from backend.devices.protocols import Camera, Projector
 from backend.domain.errors import UnglareError
 
@@ -91,7 +98,9 @@ def driver_entries(group: str) -> tuple[DriverEntry, ...]:
     return (*ours, *others)
 
 
-def load_factory(group: str, name: str, driver: str) -> Callable[..., Any]:
+def load_factory(
+    group: str, name: str, driver: str, within_s: float = IMPORT_S
+) -> Callable[..., Any]:
     """Import a driver and return its factory; `name` is what sentences call the device.
 
     A factory may have attributes: `options_model`, the pydantic model of the options that it takes, `library`, which
@@ -104,7 +113,7 @@ def load_factory(group: str, name: str, driver: str) -> Callable[..., Any]:
     RigConfigError
         If there is no such driver or it can't be loaded.
     """
-    factory = _imported(group, name, driver)
+    factory = _imported(group, name, driver, within_s)
     if not callable(factory):
         raise RigConfigError(
             f"{name}: driver {driver} is a {type(factory).__name__}, not a function that makes a device; check its"
@@ -125,14 +134,14 @@ def missing_library(factory: Callable[..., Any]) -> str | None:
     return None
 
 
-def _imported(group: str, name: str, driver: str) -> Any:
+def _imported(group: str, name: str, driver: str, within_s: float) -> Any:
     entry, place = plug_ins(group).get(driver), _BUILT_IN[group].get(driver)
     if place is not None:
         module, _, attribute = place.partition(":")
         return getattr(importlib.import_module(module), attribute)
     if entry is not None:
         try:
-            return load_plug_in(entry)
+            return load_plug_in(entry, within_s)
         except RigConfigError as error:
             raise RigConfigError(f"{name}: {error.sentence}") from error
     known = ", ".join(available_drivers(group))

@@ -12,7 +12,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from backend.devices.errors import RigConfigError, RigNotFoundError
-from backend.devices.plug_ins import call_plug_in, lacking, load_plug_in, package_of, plug_ins
+from backend.devices.plug_ins import (
+    IMPORT_S,
+    LISTED_S,
+    call_plug_in,
+    lacking,
+    load_plug_in,
+    package_of,
+    plug_ins,
+)
 from backend.devices.protocols import Rig
 
 GROUP = "unglare.rigs"
@@ -90,7 +98,7 @@ def options_schema(name: str) -> dict[str, Any]:
     RigConfigError
         If the factory describes its options by what is no pydantic model.
     """
-    return schema_of(f"rig {name}: its factory's options_model", _factory(name))
+    return schema_of(f"rig {name}: its factory's options_model", _factory(name, LISTED_S))
 
 
 def schema_of(what: str, factory: object) -> dict[str, Any]:
@@ -139,10 +147,10 @@ def method_for(rig: str) -> str:
     return str(methods[0]) if methods else DEFAULT_METHOD
 
 
-def _factory(name: str) -> Callable[[Mapping[str, object]], Any]:
+def _factory(name: str, within_s: float = IMPORT_S) -> Callable[[Mapping[str, object]], Any]:
     entry = None if name in _BUILT_IN else plug_ins(GROUP).get(name)
     if entry is not None:
-        return _callable(name, load_plug_in(entry))
+        return _callable(name, load_plug_in(entry, within_s))
     place = _BUILT_IN.get(name, name)
     if ":" in place:
         module, _, attribute = place.partition(":")

@@ -5,6 +5,7 @@ seconds, and doesn't keep the application from ending. What it raises, Ctrl+C's 
 """
 
 import threading
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from importlib.metadata import EntryPoint, entry_points
@@ -13,10 +14,13 @@ from typing import Any
 from backend.devices.errors import RigConfigError
 from backend.domain.errors import UnglareError
 
-IMPORT_S = 15.0
-"""So long a package may take to be imported."""
+IMPORT_S = 60.0
+"""So long a package may take to be imported where somebody wants to use it."""
+LISTED_S = 3.0
+"""So long where it is only listed; it may be there the next time."""
 
-_pending: dict[EntryPoint, "Future[Any]"] = {}
+_pending: dict[EntryPoint, tuple["Future[Any]", float]] = {}
+"""Imports that run, and when they began."""
 _lock = threading.Lock()
 
 
@@ -41,36 +45,35 @@ def package_of(entry: EntryPoint) -> str:
         return "a package without version"
 
 
-def load_plug_in(entry: EntryPoint) -> Any:
+def load_plug_in(entry: EntryPoint, within_s: float = IMPORT_S) -> Any:
     """Import what an entry point names.
 
     Raises
     ------
+    PlugInPendingError
+        If that takes too long.
     PlugInError
-        If that fails in whatever way.
+        If it fails in whatever way.
     """
     with _lock:
-        before = _pending.get(entry)
-        if before is None:
-            before = _pending[entry] = _aside(entry.load)
-            began_now = True
-        else:
-            began_now = False
+        if entry not in _pending:
+            _pending[entry] = _aside(entry.load), time.monotonic()
+        importing, began_s = _pending[entry]
     try:
         # Who comes later doesn't wait once more for an import that hangs.
-        return before.result(timeout=IMPORT_S if began_now else 0.1)
+        return importing.result(timeout=max(began_s + within_s - time.monotonic(), 0.0))
     except TimeoutError as error:
-        if before.done():
+        if importing.done() and importing.exception() is error:  # the package's own
             raise _failed(entry, error) from error
         raise PlugInPendingError(
-            f"{_named(entry)} is still being imported after {IMPORT_S:g} s; wait, or mend or remove it"
+            f"{_named(entry)} is still being imported after {within_s:g} s; ask again, or mend or remove it"
         ) from None
     except BaseException as error:
-        if not before.done():
+        if not importing.done():
             raise  # somebody pressed Ctrl+C here
         raise _failed(entry, error) from error
     finally:
-        if before.done():
+        if importing.done():
             _pending.pop(entry, None)
 
 

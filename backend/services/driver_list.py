@@ -12,6 +12,7 @@ from backend.devices.driver_loading import (
     missing_library,
 )
 from backend.devices.loading import schema_of
+from backend.devices.plug_ins import LISTED_S
 from backend.domain.errors import NotFoundError, UnglareError
 
 
@@ -63,7 +64,7 @@ def list_drivers(name: str = "") -> tuple[ListedDriver, ...]:
 def _listed(group: str, name: str, package: str) -> ListedDriver:
     kind = group.removeprefix("unglare.").removesuffix("s")
     try:
-        factory = load_factory(group, kind, name)
+        factory = load_factory(group, kind, name, LISTED_S)
         schema = schema_of(f"driver {name}: its factory's options_model", factory)
     except UnglareError as error:
         sentence = error.sentence.removeprefix(f"{kind}: ")
