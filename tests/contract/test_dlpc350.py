@@ -27,12 +27,13 @@ from backend.devices.errors import (
     DeviceTimeout,
     FeatureError,
     GeometryError,
+    IncompleteFrame,
     RigConfigError,
 )
 from backend.devices.pages import PageDesk
 from backend.devices.pattern_set import NewPattern, PatternSet, write_set
 from backend.devices.peers.dlpc350 import SimulatedDlpc350, load_ms
-from backend.devices.protocols import LinkState, Rig, SequenceProjector, TriggerSource
+from backend.devices.protocols import Frame, LinkState, Rig, SequenceProjector, TriggerSource
 from backend.domain.patterns import Sine, Uniform
 from backend.jobs.rendering import render
 from tests.lightcrafter_hardware import lightcrafter_hardware
@@ -606,19 +607,33 @@ def test_a_sequence_brings_every_frame_of_every_camera(addresses, folder):
     """24 fringes at 16.7 ms: 24 frames of each camera, in order, equally spaced by its own clock."""
     with laboratory(addresses, folder) as rig:
         rig.projector.load([fringe(k) for k in range(STEPS)])
+        for frames in _sequence(rig):
+            spacing_s = np.diff([f.timestamp_s for f in frames])
+            np.testing.assert_allclose(spacing_s, 0.016667, atol=1e-6)
+            assert np.unique(np.diff([f.frame_id for f in frames])).tolist() == [1]
+            _in_order(np.array([f.data for f in frames], float))
+
+
+def _sequence(rig: Rig) -> list[list[Frame]]:
+    """Run it, again as a scan does if a packet came too late on a busy machine."""
+    for attempt in (1, 2, 3):
         for camera in rig.cameras.values():
+            camera.disarm()
             camera.configure(
                 replace(camera.settings, exposure_us=12_000.0, trigger=TriggerSource.LINE1)
             )
             camera.arm(STEPS)
         rig.projector.arm_sequence(range(STEPS), 16_437.0, 16_667.0)
         rig.projector.start_sequence()
-        for camera in rig.cameras.values():
-            frames = [camera.get_frame(timeout_s=10.0) for _ in range(STEPS)]
-            spacing_s = np.diff([f.timestamp_s for f in frames])
-            np.testing.assert_allclose(spacing_s, 0.016667, atol=1e-6)
-            assert np.unique(np.diff([f.frame_id for f in frames])).tolist() == [1]
-            _in_order(np.array([f.data for f in frames], float))
+        try:
+            return [
+                [camera.get_frame(timeout_s=10.0) for _ in range(STEPS)]
+                for camera in rig.cameras.values()
+            ]
+        except (IncompleteFrame, DeviceTimeout):
+            if attempt == 3:
+                raise
+    raise AssertionError("the last attempt returns or raises")
 
 
 def _in_order(frames: np.ndarray) -> None:
