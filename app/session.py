@@ -719,8 +719,11 @@ class Session:
                 self.load(
                     lambda: self._show_live(event.rig, event.camera), key=f"live {event.camera}"
                 )
-        elif isinstance(event, RigChanged) and look is None:
-            self._rig_changed(event.rig)
+        elif isinstance(event, RigChanged):
+            if not self.who.may_operate:
+                self.act(lambda: self._follow_rig(event.rig), key=f"rig {event.rig}")
+            elif look is None:
+                self._rig_changed(event.rig)
 
     def _rig_changed(self, rig: str) -> None:
         desk = self._rig_desk
@@ -728,6 +731,19 @@ class Session:
             desk.changed(rig)
         else:
             self.show_rig()
+
+    def _follow_rig(self, rig: str) -> None:
+        """Show a viewer the rig that somebody sets up: a viewer has no controls to choose it."""
+        desk, look = self._rig_desk, self._look
+        if desk is None or (look is not None and look.running):
+            return
+        live = self.api.live(rig)
+        if desk.rig == rig:
+            desk.changed(rig)
+            if not live.running:
+                self._go_home()
+        elif live.running and live.owner is None:
+            self._open_rig(rig, {})
 
     def _scan_changed(self, scan_id: str | None) -> None:
         look = self._look

@@ -183,7 +183,9 @@ class RigDeskPanel:
         if rig is None:
             return
         try:
-            self._draw_live(self._desk.api.set_live(rig, settings))
+            live = self._desk.api.set_live(rig, settings)
+            self._light.put(live.settings)  # snapped: what was typed may stand there still
+            self._draw_live(live)
         except ApiError:
             if state is not None:
                 self._light.show(self._desk.api.rig_state(rig), anew=True)
@@ -206,7 +208,8 @@ class RigDeskPanel:
             )
         head = markup.div("ug-head", back + markup.div("ug-names", title + below))
         if state.owner is not None:
-            words = f"{state.owner.who} {state.owner.doing}. Its pictures are shown; controls come back when it ends."
+            shown = "Its pictures are shown; c" if state.owner.scan else "C"
+            words = f"{state.owner.who} {state.owner.doing}. {shown}ontrols come back when it ends."
             return head + markup.div("ug-handed ug-owner", markup.esc(words))
         if state.failure:
             return head + markup.div("ug-why", markup.esc(state.failure))

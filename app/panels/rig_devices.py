@@ -68,9 +68,7 @@ class DevicesPanel:
         chosen = next((label for label, o in self._offers.items() if o.name == rig), rig)
         self._menu.options = tuple(dict.fromkeys((*self._offers, chosen)))
         self._menu.value = chosen
-        error = next((offer.error for offer in offers if offer.name == rig), None)
-        self._drawn = markup.div("ug-why", markup.esc(error)) if error else ""
-        self._devices.content = self._drawn
+        self._drawn = self._devices.content = ""
 
     def show(self, state: RigState) -> None:
         """Show this state."""
@@ -191,6 +189,8 @@ def _box(name: str, state: str, colour: str, lines: list[str]) -> str:
 
 
 def _projector_note(state: RigState) -> str:
+    if state.owner is not None and not state.owner.scan:
+        return ""  # a calibration sets it to 0 meanwhile
     if state.settle_ms is None:
         return "settle time not measured" if state.keeps_latency else ""
     words = f"settles in {number(state.settle_ms, 3)} ms"

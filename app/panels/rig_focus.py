@@ -16,6 +16,7 @@ from backend.contract.rigs import LiveCamera, LiveView
 _PART_PX = 128
 _MAGNIFIED = 3
 _PANEL_PX = (300, 350)
+_IN_A_ROW = 3
 _OLD_S = 2.0
 """A picture older than that, beyond twice its exposure, isn't live any more."""
 
@@ -30,6 +31,8 @@ class FocusPanel:
         gui.add_html(markup.div("ug-heading", "Gray levels"))
         self._chart = LevelsChart(gui)
         self._cards = gui.add_html("")
+        self._lately: dict[str, dict[int, float]] = {}
+        """Of each camera: sharpness by the number of the picture."""
         self._best: dict[str, float] = {}
         self._pattern = ""
         self._place: tuple[str, int, int] | None = None
@@ -43,15 +46,16 @@ class FocusPanel:
 
     def forget(self) -> None:
         """Another rig, or none: what was best doesn't count any more."""
-        self._best = {}
+        self._start_anew()
         self._put_away()
 
     def show(self, live: LiveView, cameras: list[str]) -> None:
         """Show what the newest pictures say."""
         if live.settings.pattern != self._pattern:
-            self._best, self._pattern = {}, live.settings.pattern
+            self._pattern = live.settings.pattern
+            self._start_anew()
         for camera in live.cameras:
-            self._best[camera.camera] = max(self._best.get(camera.camera, 0.0), camera.sharpness)
+            self._remember(camera)
         self._chart.show(cameras, {c.camera: c.histogram for c in live.cameras})
         known = {c.camera: c for c in live.cameras}
         content = "".join(self._card(i, name, known.get(name)) for i, name in enumerate(cameras))
@@ -85,6 +89,19 @@ class FocusPanel:
         else:
             self._part.image = part
 
+    def _start_anew(self) -> None:
+        self._lately, self._best = {}, {}
+
+    def _remember(self, camera: LiveCamera) -> None:
+        """Keep the best sharpness: of three pictures in a row the middle one counts, so no single one does."""
+        lately = self._lately.setdefault(camera.camera, {})
+        lately[camera.number] = camera.sharpness
+        for old in sorted(lately)[:-_IN_A_ROW]:
+            del lately[old]
+        if len(lately) == _IN_A_ROW:
+            now = float(np.median(list(lately.values())))
+            self._best[camera.camera] = max(self._best.get(camera.camera, 0.0), now)
+
     def _put_away(self) -> None:
         self._place = None
         self._planes.unmark()
@@ -111,7 +128,8 @@ class FocusPanel:
 
     def _sharpness(self, camera: LiveCamera) -> str:
         best = self._best.get(camera.camera, 0.0)
-        share = max(0.0, camera.sharpness / best) if best > 0 else 0.0
+        now = float(np.median(list(self._lately.get(camera.camera, {0: 0.0}).values())))
+        share = max(0.0, now / best) if best > 0 else 0.0
         colour = "#3fae6a" if share >= 0.95 else "#e8a33d" if share >= 0.7 else "#e25555"
         bar = f'<div class="ug-progress"><div style="width:{100 * share:.0f}%;background:{colour}"></div></div>'
         words = (
@@ -122,13 +140,13 @@ class FocusPanel:
         return markup.div("ug-sharp", words)
 
     def _foot(self) -> str:
-        hint = "Click a picture to magnify a part; the wheel zooms."
+        hint = "Click a picture to magnify a part."
         if not self._desk.who.may_operate:
             return ""
         reset = self._desk.clicks.label(
             "reset best",
             self._best.clear,
-            "reset best sharpness",
+            "reset best",
             "ug-link",
             "Start the focus aid anew",
         )
@@ -139,7 +157,7 @@ def _shares(camera: LiveCamera) -> str:
     cells = (
         ("mean", f"{camera.mean_gray:.0f} of {2**camera.bit_depth - 1}", ""),
         ("saturated", percent(camera.saturated_share), "#e23030" if camera.saturated_share > 0 else ""),
-        ("at 0", percent(camera.black_share), "#3f86ff" if camera.black_share > 0 else ""),
+        ("black", percent(camera.black_share), "#3f86ff" if camera.black_share > 0 else ""),
     )  # fmt: skip
     inner = "".join(
         f'<span>{name} <b style="color:{colour or "inherit"}">{markup.esc(value)}</b></span>'

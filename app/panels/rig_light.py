@@ -73,7 +73,7 @@ class LightPanel:
         if old is None or anew or _reach(old) != _reach(state):
             self._show_reach(state)
         if old is None or anew or old.name != state.name:
-            self._put(state.live)
+            self.put(state.live)
         is_free = state.owner is None and state.link is RigLink.OPEN
         for control in self._controls():
             control.disabled = not is_free
@@ -85,7 +85,7 @@ class LightPanel:
     def show_live(self, live: LiveView) -> None:
         """Show the settings in force, unless something is typed just now."""
         if live.settings != self._settings and self._waiting is None:
-            self._put(live.settings)
+            self.put(live.settings)
             self._draw_patterns()
 
     # ---- drawing
@@ -110,7 +110,8 @@ class LightPanel:
         self._grid = stops_ms(state.exposure_ms, period_ms)
         self._stops.max = max(len(self._grid) - 1, 1)
 
-    def _put(self, settings: LiveSettings) -> None:
+    def put(self, settings: LiveSettings) -> None:
+        """Write the settings in force into the controls."""
         is_other_grid = settings.snap != self._settings.snap
         self._settings = settings
         if is_other_grid:

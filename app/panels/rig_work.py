@@ -43,7 +43,7 @@ class RigWorkPanel:
             "Try", color="gray", icon=viser.Icon.CHECKLIST, hint="A white and a black frame of each camera, and what looks wrong"
         )  # fmt: skip
         latency = gui.add_button(
-            "Measure latency", color="gray", icon=viser.Icon.HOURGLASS, hint="Measure how long after its acknowledgement the projector shows a pattern"
+            "Latency", color="gray", icon=viser.Icon.HOURGLASS, hint="Measure how long after its acknowledgement the projector shows a pattern"
         )  # fmt: skip
         self._buttons = [attempt, latency]
         api = self._desk.api

@@ -125,6 +125,16 @@ def head_html(look: Look, desk: Desk, clicks: Clicks | None) -> str:
             "Write the results to a folder, or download the cloud",
         ),
     ]
+    if scan.rig:
+        tools.append(
+            clicks.label(
+                "rig",
+                lambda: desk.open_rig(scan.rig, dict(scan.rig_options)),
+                "◉ Rig",
+                "ug-tool",
+                "Live pictures, light, focus, latency of its rig (key L)",
+            )
+        )
     if look.captures:
         tools.insert(
             1,

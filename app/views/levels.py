@@ -9,7 +9,7 @@ import viser
 from app.palette import CAMERAS
 from app.views.curve import axes
 
-_HEIGHT_PX = 150
+_HEIGHT_PX = 138
 _BINS = 256
 _TOP = 6.6
 """log10 of four million pixels."""
@@ -30,7 +30,9 @@ class LevelsChart:
         self._cameras: tuple[str, ...] | None = None
 
     def show(self, cameras: Sequence[str], histograms: Mapping[str, Sequence[int]]) -> None:
-        """Draw the counts of each camera; one without counts is a line at the bottom."""
+        """Draw the counts of each camera; without any, nothing changes."""
+        if not histograms:
+            return
         if tuple(cameras) != self._cameras:
             self._make(tuple(cameras))
         none = np.zeros(_BINS)
@@ -50,7 +52,7 @@ class LevelsChart:
             self._chart = self._gui.add_uplot(
                 (x, *(np.zeros(_BINS) for _ in cameras)),
                 ({"label": "gray"}, *series),
-                scales={"x": {"time": False, "range": (0.0, _BINS - 1.0)}, "y": {"range": (0.0, _TOP)}},
+                scales={"x": {"time": False}, "y": {"range": (0.0, _TOP)}},
                 axes=axes("gray level, 0 to 255 of full scale", "log₁₀ pixels"),
                 legend={"show": False}, cursor={"drag": {"x": False, "y": False}},
                 height=_HEIGHT_PX, padding=(8, 14, 0, 0),

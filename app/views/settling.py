@@ -12,6 +12,7 @@ from app.views.curve import axes
 from backend.contract.rigs import LatencyView
 
 _HEIGHT_PX = 132
+_THIN = 1e-3
 _UP, _DOWN = label_colour(3), label_colour(1)
 
 
@@ -41,21 +42,20 @@ class SettlingChart:
         if self._chart is not None:
             self._chart.remove()
         delays = np.array(found.delays_ms)
-        settled = np.array([0.0, found.settle_ms, found.settle_ms + 1e-3])
-        x = np.unique(np.concatenate([delays, settled[1:]]))
+        x = np.unique(np.concatenate([delays, found.settle_ms + np.array([-_THIN, 0.0, _THIN])]))
         up, down = (np.interp(x, delays, np.array(values)) for values in (found.up, found.down))
-        mark = np.where(np.isclose(x, found.settle_ms), 2.0, -1.0)
+        mark = np.where(x == found.settle_ms, 2.0, -1.0)
         with self._chart_place:
             self._chart = self._gui.add_uplot(
                 (x, up, down, mark),
                 (
                     {"label": "delay"},
-                    _line("black to white", _UP),
-                    _line("white to black", _DOWN),
+                    _line("black to white", _UP, 4.0),  # below the other one, which often covers it
+                    _line("white to black", _DOWN, 1.4),
                     {"label": "settle time", "stroke": "rgba(255,255,255,.8)", "width": 1.2, "dash": (4, 3), "points": {"show": False}},
                 ),
                 scales={"x": {"time": False, "range": (0.0, float(x[-1]) * 1.02)}, "y": {"range": (-0.05, 1.1)}},
-                axes=axes("after the acknowledgement [ms]", "share of the change"),
+                axes=axes("after the acknowledgement [ms]", "share of change"),
                 legend={"show": False}, cursor={"drag": {"x": False, "y": False}},
                 height=_HEIGHT_PX, padding=(8, 14, 0, 0),
             )  # fmt: skip
@@ -77,10 +77,10 @@ def words_html(found: LatencyView) -> str:
     return markup.div("ug-curves", keys) + markup.facts(rows) + note
 
 
-def _line(label: str, colour: str) -> Any:
+def _line(label: str, colour: str, width: float) -> Any:
     return {
         "label": label,
         "stroke": colour,
-        "width": 1.6,
+        "width": width,
         "points": {"show": True, "size": 4, "fill": colour},
     }

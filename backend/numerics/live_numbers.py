@@ -11,7 +11,7 @@ Gray = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 BINS = 256
 """Bins of the histogram: one per gray level at 8 bit, one per 16 levels at 12 bit."""
 _RED = (226, 48, 48)
-_BLUE = (48, 110, 255)
+_BLUE = (28, 70, 180)
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,7 @@ class RigDesk:
             If there is no such rig.
         """
         status, title = self._context.rigs.status(rig), self._title(rig)
+        broken = {offer.name: offer.error for offer in self._context.offers()}.get(rig)
         exposure_ms, gain_db = _limits(status)
         settle_ms = _settle_ms(status)
         kept = self._kept(rig)
@@ -83,7 +84,7 @@ class RigDesk:
             title=title,
             link=status.link,
             options=dict(status.options or {}),
-            failure=status.failure,
+            failure=status.failure or broken,
             owner=_owner(status.owner),
             devices=tuple(map(_device, status.devices)),
             exposure_ms=exposure_ms,

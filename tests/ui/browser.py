@@ -77,6 +77,12 @@ class Desk:
         row = rows.filter(visible=True).last
         return row.locator("input, textarea").last
 
+    def choose(self, label: str, option: str) -> None:
+        """Choose from a menu."""
+        rows = self.page.locator("div:has(> div > p > label)", has_text=label)
+        rows.filter(visible=True).last.locator("input:not([type=hidden])").click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
     def points(self) -> int:
         """Count the points in the scene."""
         script = "() => {let k = 0; window.__viserMutable.scene.traverse(o => {if (o.isPoints) k += o.geometry.attributes.position.count}); return k}"

@@ -56,7 +56,7 @@ def chromium(playwright: Playwright, chromium_program: str) -> Iterator[Browser]
 @pytest.fixture(scope="session")
 def first_desk(chromium: Browser, served: Served) -> Iterator[Desk]:
     """Open one page for all tests that need only one: opening takes longer than most of them."""
-    with _desk(chromium) as desk:
+    with open_desk(chromium) as desk:
         yield desk.open(served.address("Anna"))
 
 
@@ -70,7 +70,7 @@ def seat(chromium: Browser, served: Served, first_desk: Desk) -> Iterator[Seat]:
             if user == "Anna":
                 desks.append(first_desk.go_home())
             else:
-                desk = pages.enter_context(_desk(chromium))
+                desk = pages.enter_context(open_desk(chromium))
                 desks.append(desk.open(served.address(user, role)))
             return desks[-1]
 
@@ -84,7 +84,8 @@ def seat(chromium: Browser, served: Served, first_desk: Desk) -> Iterator[Seat]:
 
 
 @contextlib.contextmanager
-def _desk(chromium: Browser) -> Iterator[Desk]:
+def open_desk(chromium: Browser) -> Iterator[Desk]:
+    """Open a window of its own."""
     context = chromium.new_context(viewport={"width": 1280, "height": 800})
     context.set_default_timeout(PATIENCE_MS)
     try:

@@ -82,7 +82,7 @@ def test_what_has_no_sharpness_has_none() -> None:
     assert sharpness(np.full((2, 20), 77, np.uint8)) == 0.0
 
 
-@pytest.mark.parametrize(("level", "colour"), [(255, (226, 48, 48)), (0, (48, 110, 255))])
+@pytest.mark.parametrize(("level", "colour"), [(255, (226, 48, 48)), (0, (28, 70, 180))])
 def test_one_extreme_pixel_is_marked_in_a_smaller_picture(
     level: int, colour: tuple[int, int, int]
 ) -> None:
