@@ -223,7 +223,7 @@ def test_a_camera_that_runs_freely_shows_the_new_pattern_after_the_frames_that_w
         while (
             peers[0]._block_id < sent + 5
         ):  # as nobody fetches, every buffer holds a dark frame then
-            time.sleep(0.01)
+            threading.Event().wait(0.01)
         simulated.projector.blank(255)
         means = [float(camera.get_frame().data.mean()) for _ in range(8)]
     waiting = camera.capabilities.buffered_frames + 1
