@@ -19,6 +19,8 @@ LATENCY_SUFFIX = ".latency.json"
 """Beside a rig's file: what the latency calibration found."""
 ASSUMED_REFRESH_HZ = 60.0
 """Of a display that tells no refresh rate."""
+_OF_ONE_SIZE = {"dlpc350"}
+"""Drivers of a single kind of projector: their entries needn't say its size."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,40}")
 
 
@@ -104,6 +106,8 @@ class RigShelf:
             text = self._latency_path(name).read_text("utf-8")
             known = KnownLatency.model_validate_json(text)
             said = dict(file.projector.model_extra or {})
+            if file.projector.driver in _OF_ONE_SIZE:
+                said = {"size": known.size, "refresh_hz": known.refresh_hz, **said}
             same = _same_mode(known, said, measures_itself=file.projector.driver == "page")
         except (OSError, ValueError):
             return file

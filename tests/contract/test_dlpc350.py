@@ -1,6 +1,7 @@
 """LightCrafter 4500 for real, as far as that goes without one: the driver against a simulated DLPC350, and a whole rig
 of it and GigE Vision cameras on its trigger line."""
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -34,6 +35,7 @@ from backend.devices.pages import PageDesk
 from backend.devices.pattern_set import NewPattern, PatternSet, write_set
 from backend.devices.peers.dlpc350 import SimulatedDlpc350, load_ms
 from backend.devices.protocols import Frame, LinkState, Rig, SequenceProjector, TriggerSource
+from backend.devices.rig_shelf import RigShelf
 from backend.domain.patterns import Sine, Uniform
 from backend.jobs.rendering import render
 from tests.lightcrafter_hardware import lightcrafter_hardware
@@ -543,6 +545,19 @@ def test_another_process_connects_at_a_path_one_at_a_time(tmp_path, folder, flas
         second.reconnect()
         second.close()
     assert not Path(path).exists()
+
+
+def test_a_measured_latency_is_waited_for(tmp_path, folder):
+    """Its rig file says no size: there is only one."""
+    entry = f"projector: {{driver: dlpc350, patterns: {folder}}}"
+    (tmp_path / "bench.yaml").write_text(
+        f"cameras: {{left: {{driver: aravis, address: 127.0.0.9}}}}\n{entry}\n"
+    )
+    shelf = RigShelf(tmp_path, PageDesk())
+    assert shelf.open("bench", {}).projector.settle_ms is None
+    kept = {"size": [WIDTH, HEIGHT], "refresh_hz": 120.0048, "settle_ms": 25.0}
+    (tmp_path / "bench.latency.json").write_text(json.dumps(kept))
+    assert shelf.open("bench", {}).projector.settle_ms == 25.0
 
 
 def test_without_a_device_on_usb_it_is_one_sentence(folder):
