@@ -219,10 +219,9 @@ def test_a_camera_that_runs_freely_shows_the_new_pattern_after_the_frames_that_w
         camera.configure(replace(camera.settings, trigger=TriggerSource.FREE_RUN))
         camera.arm()
         dark = float(camera.get_frame().data.mean())
+        # As nobody fetches, every buffer holds a dark frame when five more were sent.
         sent = peers[0]._block_id
-        while (
-            peers[0]._block_id < sent + 5
-        ):  # as nobody fetches, every buffer holds a dark frame then
+        while peers[0]._block_id < sent + 5:
             threading.Event().wait(0.01)
         simulated.projector.blank(255)
         means = [float(camera.get_frame().data.mean()) for _ in range(8)]
