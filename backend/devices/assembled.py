@@ -145,6 +145,12 @@ class AssembledRig:
 
     def _camera_facts(self, name: str) -> CameraFacts:
         can, sensor = self._cameras[name].capabilities, self._sensors[name]
+        line = self._trigger_lines.get(name)
+        if line is not None and line not in can.trigger_sources:
+            there = ", ".join(can.trigger_sources)
+            raise RigConfigError(
+                f"{name}: the camera has no trigger line {line}, it has {there}; correct trigger_line"
+            )
         width_px, height_px = can.sensor_size
         shortest_us, longest_us = self._exposures_us(name)
         gain_db = self._limits.get(name, CameraLimits()).largest_gain_db

@@ -8,14 +8,17 @@
     projector: {driver: page, size: 1280x800}
     snap_exposures: true
 
-The first camera is the reference. `trigger_line: Line1` says which line of a camera the projector's trigger output
-drives; `limits: {longest_exposure_ms: 500, largest_gain_db: 12}` what a camera shall not be used beyond. What a driver needs besides (`address` above) is its own matter.
+The first camera is the reference unless `reference: right` says otherwise. `trigger_line: Line1` says which line of a camera the projector's trigger output
+drives; `limits: {longest_exposure_ms: 500, largest_gain_db: 12}` what a camera shall not be used beyond. What a driver
+needs besides (`address` above) is its own matter: `unglare drivers NAME`. `calibration` is an entry (`CalibrationEntry`)
+or the name of a file that holds one.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import yaml
@@ -25,7 +28,7 @@ from backend.devices.assembled import AssembledRig, CameraLimits, SensorFacts
 from backend.devices.driver_loading import make_camera, make_projector
 from backend.devices.errors import RigConfigError
 from backend.devices.pages import PageDesk
-from backend.devices.protocols import TriggerSource
+from backend.devices.protocols import Projector, SequenceProjector, TriggerSource
 from backend.domain.rig import PinholeModel, Pose, RigCalibration
 from backend.numerics.pinhole import DISTORTION_SIZES
 
@@ -33,6 +36,8 @@ _Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[fl
 
 
 _LINES = [s.value for s in TriggerSource if s.value.startswith("Line")]
+_IDENTITIES = ("address", "serial", "source", "device")
+"""Options that drivers tell devices apart by."""
 _CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,40}")
 
 
@@ -66,6 +71,12 @@ class CameraEntry(BaseModel):
     trigger_line: TriggerSource | None = None
     """The line that the projector's trigger output drives; None: not wired."""
     limits: LimitsEntry = LimitsEntry()
+
+    def same_device(self, other: "CameraEntry") -> str:
+        """Return the option by which another entry means the same device; empty: it means another one."""
+        mine, its = self.model_extra or {}, other.model_extra or {}
+        same = [k for k in _IDENTITIES if mine.get(k) is not None and mine.get(k) == its.get(k)]
+        return f"{same[0]} {mine[same[0]]}" if same and self.driver == other.driver else ""
 
     @field_validator("trigger_line")
     @classmethod
@@ -135,6 +146,8 @@ class RigFile(_Part):
 
     title: str = ""
     cameras: dict[str, CameraEntry] = Field(min_length=1)
+    reference: str | None = None
+    """The camera whose pixels are measured; None: the first."""
     projector: ProjectorEntry
     snap_exposures: bool = True
     """Exposures are whole frame periods of the projector, so that its modulation averages out."""
@@ -149,16 +162,11 @@ class RigFile(_Part):
         RigConfigError
             If it can't be read, isn't YAML, or an entry is unknown, missing or can't be used.
         """
-        try:
-            document = yaml.safe_load(path.read_text("utf-8"))
-        except (OSError, UnicodeDecodeError) as error:
-            raise RigConfigError(
-                f"rig file {path} can't be read ({error}); check name and rights"
-            ) from error
-        except yaml.YAMLError as error:
-            raise RigConfigError(
-                f"rig file {path} isn't YAML ({_first_line(error)}); mend that line"
-            ) from error
+        document = read_yaml("rig file", path)
+        if isinstance(document, dict) and isinstance(document.get("calibration"), str):
+            document["calibration"] = read_yaml(
+                f"rig file {path}: calibration", path.parent / document["calibration"]
+            )
         return cls.of(document, str(path))
 
     @classmethod
@@ -168,11 +176,7 @@ class RigFile(_Part):
             return cls.model_validate(document)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
-            place = ".".join(map(str, first["loc"])) or "the whole file"
-            problem = first["msg"].removeprefix("Value error, ")
-            raise RigConfigError(
-                f"rig file {name}: {place}: {problem[0].lower() + problem[1:]}; mend it"
-            ) from None
+            raise RigConfigError(f"rig file {name}: {_problem(cls, first)}") from None
 
     @property
     def page(self) -> str | None:
@@ -189,6 +193,25 @@ class RigFile(_Part):
                     f"{name!r} is no name for a camera: use letters, digits, dashes and underscores, and not `projector`"
                 )
         return value
+
+    @model_validator(mode="after")
+    def _refers_to_its_cameras(self) -> "RigFile":
+        if self.reference is not None and self.reference not in self.cameras:
+            raise ValueError(
+                f"reference {self.reference!r} is none of its cameras: choose {', '.join(self.cameras)}"
+            )
+        for one, other in combinations(self.cameras, 2):
+            same = self.cameras[one].same_device(self.cameras[other])
+            if same:
+                raise ValueError(
+                    f"{one} and {other} are the same device ({same}): give each its own"
+                )
+        return self
+
+    @property
+    def reference_camera(self) -> str:
+        """Name of the reference camera."""
+        return self.reference or next(iter(self.cameras))
 
     @model_validator(mode="after")
     def _no_strangers(self) -> "RigFile":
@@ -213,9 +236,11 @@ def assemble(name: str, file: RigFile, desk: PageDesk) -> AssembledRig:
     projector = make_projector(
         "projector", file.projector.driver, _options(file.projector), desk.for_rig(name)
     )
+    _refuse_useless_wires(file, projector)
+    first = file.reference_camera
     return AssembledRig(
         name,
-        cameras,
+        {first: cameras[first], **cameras},
         projector,
         sensors={
             camera: SensorFacts(**entry.sensor.model_dump())
@@ -240,11 +265,90 @@ def _calibration(file: RigFile) -> RigCalibration | None:
     return RigCalibration(
         cameras={name: view.model for name, view in known.cameras.items()},
         camera_from_world={name: view.device_from_world for name, view in known.cameras.items()},
-        reference=next(iter(file.cameras)),
+        reference=file.reference_camera,
         projector=known.projector.model if known.projector else None,
         projector_from_world=known.projector.device_from_world if known.projector else None,
     )
 
 
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]
+def _refuse_useless_wires(file: RigFile, projector: Projector) -> None:
+    """Refuse trigger lines where nothing drives them: the rig would be slower than its owner thinks."""
+    wired = [name for name, entry in file.cameras.items() if entry.trigger_line]
+    if wired and not isinstance(projector, SequenceProjector):
+        raise RigConfigError(
+            f"{wired[0]}: trigger_line {file.cameras[wired[0]].trigger_line} has no use, projector driver"
+            f" {file.projector.driver} has no trigger output; leave it out"
+        )
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that stands twice: the first entry would be lost without a word."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Read a mapping."""
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        twice = [key for key in keys if keys.count(key) > 1]
+        if twice:
+            raise yaml.YAMLError(
+                f"{twice[0]!r} stands twice in the entry that begins in line {node.start_mark.line + 1}"
+            )
+        return dict(super().construct_mapping(node, deep))
+
+
+def read_yaml(what: str, path: Path) -> Any:
+    """Read a YAML file; `what` is what sentences call it.
+
+    Raises
+    ------
+    RigConfigError
+        If it can't be read, isn't YAML, or a key stands twice.
+    """
+    try:
+        return yaml.load(path.read_text("utf-8"), _Loader)  # noqa: S506  a safe loader
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RigConfigError(
+            f"{what} {path} can't be read ({reason}); check name and rights"
+        ) from error
+    except yaml.YAMLError as error:
+        raise RigConfigError(
+            f"{what} {path} isn't YAML ({_words(error)}); mend that line"
+        ) from error
+
+
+def _words(error: yaml.YAMLError) -> str:
+    mark = getattr(error, "problem_mark", None)
+    if mark is None:
+        return " ".join(str(error).split())[:120]
+    return f"line {mark.line + 1}: {getattr(error, 'problem', '') or 'wrong'}"
+
+
+def _problem(model: type[BaseModel], found: Any) -> str:
+    """Say what is wrong with an entry, and which there are where it is unknown."""
+    *above, last = found["loc"] or ("",)
+    place = ".".join(map(str, found["loc"])) or "the whole file"
+    if found["type"] == "missing":
+        return f"{place} is missing; add it"
+    if found["type"] == "extra_forbidden":
+        known = ", ".join(_model_at(model, above).model_fields)
+        within = f" in {'.'.join(map(str, above))}" if above else ""
+        return f"there is no entry {str(last)!r}{within}; the entries are {known}"
+    problem = str(found["msg"]).removeprefix("Value error, ")
+    problem = problem[0].lower() + problem[1:]
+    if isinstance(found["input"], str | int | float | bool):
+        return f"{place} can't be {found['input']!r}: {problem}; mend it"
+    of_all = not found["loc"] and found["type"] == "value_error"  # it names the place itself
+    return f"{problem}; mend it" if of_all else f"{place}: {problem}; mend it"
+
+
+def _model_at(model: type[BaseModel], path: Sequence[Any]) -> type[BaseModel]:
+    """Return the model of an entry, by the names that lead to it."""
+    for step in path:
+        field = model.model_fields.get(str(step))
+        if field is not None:
+            kinds = (field.annotation, *get_args(field.annotation))
+            kinds = (*kinds, *(inner for kind in kinds for inner in get_args(kind)))
+            model = next(
+                (k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), model
+            )
+    return model

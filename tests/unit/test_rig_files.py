@@ -113,6 +113,19 @@ def test_options_of_a_described_rig_are_refused(tmp_path: Path, shelf: RigShelf)
         (BENCH.replace("page,", "beamer,"), "projector: there is no driver 'beamer'; choose page"),
         (BENCH + "calibration: {cameras: {left: " + VIEW % "" + "}}", "calibration is for cameras \\['left'\\], the rig has"),
         (BENCH + "calibration: {cameras: {left: " + VIEW % ", R: [[2, 0, 0], [0, 1, 0], [0, 0, 1]]" + "}}", "no rotation"),
+        (BENCH.replace("192.0.2.3", "192.0.2.2"), r"left and right are the same device \(address 192.0.2.2\): give each its own"),
+        (BENCH.replace("right:", "left:"), "isn't YAML \\('left' stands twice in the entry that begins in line 4"),
+        (BENCH + "reference: middle", "reference 'middle' is none of its cameras: choose left, right"),
+        (BENCH + "projektor: {}", "there is no entry 'projektor'; the entries are title, cameras, reference, projector"),
+        (BENCH.replace("read_noise_e", "noise_e"), "no entry 'noise_e' in cameras.left.sensor; the entries are bit_depth"),
+        (BENCH.replace("full_well_e: 10500", "full_well_e: much"), "cameras.left.sensor.full_well_e can't be 'much': input should be a valid number"),
+        (BENCH.replace("gamma: 2.2", "gamma: 22"), "projector.gamma can't be 22: input should be less than 5"),
+        ("cameras: {left: {address: 192.0.2.2}}\nprojector: {driver: page}", "cameras.left.driver is missing; add it"),
+        ("cameras: {left: {driver: aravis, address: 192.0.2.2}}", "bench.yaml: projector is missing; add it"),
+        (BENCH.replace("192.0.2.3}", "192.0.2.3, trigger_line: Line1}"), "right: trigger_line Line1 has no use, projector driver page has no trigger output"),
+        (BENCH.replace("192.0.2.3}", "192.0.2.3, trigger_line: Line9}"), "cameras.right.trigger_line can't be 'Line9'"),
+        (BENCH.replace("192.0.2.3}", "192.0.2.3, limits: {longest_exposure: 3}}"), "no entry 'longest_exposure' in cameras.right.limits; the entries are longest_exposure_ms"),
+        (BENCH + "calibration: lost.yaml", "calibration .*lost.yaml can't be read \\(No such file"),
     ],
 )  # fmt: skip
 def test_what_cant_be_used_is_one_sentence(
@@ -123,6 +136,11 @@ def test_what_cant_be_used_is_one_sentence(
     assert "\n" not in str(refused.value)
 
 
+def test_another_camera_may_be_the_reference(tmp_path: Path, shelf: RigShelf) -> None:
+    kept = shelf.add(written(tmp_path, BENCH + "reference: right"))
+    assert list(shelf.open(kept.name, {}).cameras) == ["right", "left"]
+
+
 def test_a_missing_file_is_named(tmp_path: Path, shelf: RigShelf) -> None:
     with pytest.raises(RigConfigError, match=r"lost\.yaml can't be read"):
         shelf.add(tmp_path / "lost.yaml")
@@ -131,7 +149,7 @@ def test_a_missing_file_is_named(tmp_path: Path, shelf: RigShelf) -> None:
 def test_the_calibration_is_the_first_cameras_frame() -> None:
     file = RigFile.of(
         {
-            "cameras": {n: {"driver": "aravis", "address": "192.0.2.2"} for n in ("a", "b")},
+            "cameras": {n: {"driver": "aravis", "address": f"192.0.2.{i}"} for i, n in enumerate("ab")},
             "projector": {"driver": "page", "size": "64x48"},
             "calibration": {
                 "cameras": {n: {"width_px": 64, "height_px": 48, "K": np.eye(3).tolist(), "t_mm": t} for n, t in (("a", (0, 0, 0)), ("b", (-180, 0, 0)))},
