@@ -353,6 +353,15 @@ def test_a_device_that_goes_away_during_a_sequence(device, projector, bench):
     assert projector.state is LinkState.READY
 
 
+def test_what_another_program_left_running_is_stopped(device, projector, folder, bench):
+    projector.blank(255)
+    device.unplug()  # as if that program had been killed: the device goes on
+    with projector_of(device, folder) as another:
+        assert not bench.picture.any()
+        another.blank(200)
+        assert shows(bench, even(200))
+
+
 def test_a_device_that_stays_away_is_one_sentence(folder, bench, flash):
     with SimulatedDlpc350(bench, flash) as device:
         projector = projector_of(device, folder, transport="unix:/nowhere")

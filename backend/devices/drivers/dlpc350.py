@@ -12,6 +12,7 @@ The chip is linear, has no gamma in this mode, and its 912x1140 mirrors stand on
 "diamond"): a projector model for square pixels doesn't fit it.
 """
 
+import contextlib
 import logging
 import threading
 import time
@@ -235,6 +236,8 @@ class Dlpc350Projector(Link):
         patch, minor, major = version[0] | version[1] << 8, version[2], version[3]
         self._info = replace(self._info, firmware=f"{major}.{minor}.{patch}")
         device.write(Command.POWER, b"\0")
+        with contextlib.suppress(FeatureError):  # nothing runs, or video is shown
+            device.write(Command.START_STOP, bytes((Action.STOP,)))
         device.write(Command.DISPLAY_MODE, bytes((protocol.DisplayMode.PATTERN,)))
         device.write(Command.START_STOP, bytes((Action.STOP,)))
         device.write(Command.LED_ENABLE, bytes((protocol.LEDS_BY_SEQUENCER,)))
