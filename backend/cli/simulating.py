@@ -1,17 +1,22 @@
 """`unglare simulate-hardware`: cameras on the network that look at a monitor of this machine."""
 
 import signal
+import tempfile
 import threading
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from backend.cli.options import RigOptions, Scene, Seed, Size, parse_rig_options
 from backend.cli.output import quiet_logging
 
+if TYPE_CHECKING:
+    from backend.devices.peers.simulated_light import MonitorLight
+
 _FIRST_HOST = 2
+_SOCKET = Path(tempfile.gettempdir()) / "unglare-lightcrafter.sock"
 
 
 def register(application: typer.Typer) -> None:
@@ -38,6 +43,21 @@ def simulate_hardware(
             help="Number of the monitor that the cameras look at, as `unglare projector --list` shows; else the last one.",
         ),
     ] = None,
+    projector: Annotated[
+        Literal["monitor", "dlpc350"],
+        typer.Option(
+            help="What lights the scene: what a monitor shows, or a simulated LightCrafter 4500 that triggers the cameras."
+        ),
+    ] = "monitor",
+    patterns: Annotated[
+        Path | None,
+        typer.Option(
+            help="Set of patterns in the LightCrafter's flash, exported with --pack 24bit."
+        ),
+    ] = None,
+    socket: Annotated[
+        Path, typer.Option(help="Where the simulated LightCrafter's driver finds it.")
+    ] = _SOCKET,
     write_rig: Annotated[
         Path | None,
         typer.Option(help="Write the rig file that goes with it: `unglare rigs add FILE`."),
@@ -57,25 +77,33 @@ def simulate_hardware(
 ) -> None:
     """Simulate a rig's hardware: GigE Vision cameras that see what a monitor shows, lit onto a scene.
 
-    The projector page on that monitor is the projector; everything between is the real thing. Ends with Ctrl+C.
+    The projector page on that monitor is the projector, or a simulated LightCrafter is; everything between is the real
+    thing. Ends with Ctrl+C.
     """
     from backend.devices.loading import DEFAULT_METHOD, rig_for
-    from backend.services.kiosk import Kiosk, listed_monitors
+    from backend.devices.peers.simulated_light import LightcrafterLight
+    from backend.domain.errors import InvalidSettingError
     from backend.services.simulated_hardware import Hardware, SimulatedHardware
 
     quiet_logging()
     options = parse_rig_options(rig_options, scene=scene, size=size, seed=seed)
     rig = rig_for(scene, DEFAULT_METHOD)
     count = 1 if rig == "sim-lcd" else int(options.get("cameras", 2))
+    if projector == "dlpc350" and patterns is None:
+        raise InvalidSettingError(
+            "A simulated LightCrafter needs patterns in its flash: give --patterns FOLDER, made by unglare patterns export"
+            " --projector-size 912x1140 --pack 24bit."
+        )
     hardware = Hardware(
         rig=rig,
         options=options,
         addresses=address or [f"127.0.0.{_FIRST_HOST + n}" for n in range(count)],
-        monitor=Kiosk.choose(listed_monitors(), monitor),
+        light=LightcrafterLight(patterns, socket)
+        if projector == "dlpc350" and patterns is not None
+        else _watched(monitor, page),
         lag_ms=lag_ms,
         packet_loss=packet_loss,
         seed=seed or 0,
-        page=page,
     )
     ended = _told_to_end()
     with closing(SimulatedHardware(hardware)) as simulated:
@@ -84,8 +112,18 @@ def simulate_hardware(
             typer.echo(f"The rig file is {write_rig}; keep it: unglare rigs add {write_rig}")
         for process in simulated.peers:
             typer.echo(f"Camera {process.peer.camera} answers at {process.peer.address}.")
-        typer.echo(f"They look at monitor {hardware.monitor}. Stop with Ctrl+C.")
+        typer.echo(f"The scene is lit by {hardware.light.words}. Stop with Ctrl+C.")
         simulated.run(ended.wait)
+
+
+def _watched(monitor: int | None, page: str) -> "MonitorLight":
+    from backend.devices.peers.monitor_display import Region
+    from backend.devices.peers.simulated_light import MonitorLight
+    from backend.services.kiosk import Kiosk, listed_monitors
+
+    chosen = Kiosk.choose(listed_monitors(), monitor)
+    region = Region(chosen.left_px, chosen.top_px, chosen.width_px, chosen.height_px)
+    return MonitorLight(region, str(chosen), page=page)
 
 
 def _told_to_end() -> threading.Event:

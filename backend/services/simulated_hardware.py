@@ -1,33 +1,25 @@
-"""Simulated hardware: cameras on the network that look at a monitor, and the rig file that goes with them."""
+"""Simulated hardware: cameras on the network, what lights the scene before them, and their rig file."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from backend.devices.peers.gige_camera import Wire
-from backend.devices.peers.monitor_display import (
-    MonitorDisplay,
-    MonitorHistory,
-    Region,
-    Screen,
-    watch,
-)
+from backend.devices.peers.monitor_display import MonitorDisplay, MonitorHistory
 from backend.devices.peers.simulated_cameras import Peer, PeerProcess, make_rig
+from backend.devices.peers.simulated_light import Ended, LightSource
 from backend.devices.protocols import Rig
 from backend.devices.rig_file import RigFile
-from backend.devices.sim.renderer import Light
 from backend.domain.errors import InvalidSettingError, StartupError
 from backend.domain.rig import PinholeModel, Pose, RigCalibration
-from backend.services.kiosk import Monitor
 
-LOOKS_PER_S = 100.0
 _SIZE_OPTIONS = {"simulated": "projector_size", "sim-lcd": "screen_size"}
-_STEADY = {"simulated": {"frame_period_ms": None}, "sim-lcd": {}}
-"""A monitor's light isn't modulated within its frames."""
+_STEADY: dict[str, dict[str, Any]] = {"simulated": {"frame_period_ms": None}, "sim-lcd": {}}
+"""Light that isn't modulated within what is seen of it."""
 
 
 @dataclass(frozen=True)
@@ -38,58 +30,47 @@ class Hardware:
     """`simulated` or `sim-lcd`."""
     options: Mapping[str, Any]
     addresses: Sequence[str]
-    monitor: Monitor
-    """What the cameras look at."""
+    light: LightSource
     lag_ms: float = 0.0
-    """So much later than on the monitor everything comes to light."""
+    """So much later than it is shown everything comes to light."""
     packet_loss: float = 0.0
-    refresh_hz: float = 60.0
-    looks_per_s: float = LOOKS_PER_S
     seed: int = 0
     """Of the lost packets."""
-    page: str = "projector"
-    """Name of the projector page in the rig file."""
-    camera_options: Mapping[str, Any] = field(default_factory=dict)
-    """More keys of each camera in the rig file, for its driver."""
 
     @property
     def rig_options(self) -> dict[str, Any]:
-        """Return the simulated rig's options: its display is the monitor.
+        """Return the simulated rig's options: its display is what lights it.
 
         Raises
         ------
         InvalidSettingError
-            If they say another size than the monitor's.
+            If they say another size.
         """
-        monitor, name = self.monitor, _SIZE_OPTIONS[self.rig]
-        size = f"{monitor.width_px}x{monitor.height_px}"
+        name, (width, height) = _SIZE_OPTIONS[self.rig], self.light.size
+        size = f"{width}x{height}"
         wanted = self.options.get(name, size)
         if wanted != size:
             raise InvalidSettingError(
-                f"{name} is {wanted}, monitor {monitor} is {size}: leave the option out, or choose another --monitor."
+                f"{name} is {wanted}, {self.light.words} is {size}: leave the option out."
             )
         return {**_STEADY[self.rig], **self.options, name: size}
 
 
 class SimulatedHardware:
-    """Cameras that look at a monitor; `run` looks at it for them.
+    """Cameras on the network, each in a process; `run` lights what they see.
 
     Raises
     ------
     StartupError
         If there aren't as many addresses as cameras, or one of them is taken.
     UnglareError
-        If an option can't be used or the monitor can't be read.
+        If an option can't be used.
     """
 
     def __init__(self, hardware: Hardware) -> None:
         self._hardware = hardware
-        monitor, self._stack = hardware.monitor, ExitStack()
-        region = Region(monitor.left_px, monitor.top_px, monitor.width_px, monitor.height_px)
         with ExitStack() as stack:
-            self._screen = Screen(region)
-            stack.callback(self._screen.close)
-            self._history = MonitorHistory(monitor.width_px, monitor.height_px)
+            self._history = MonitorHistory(*hardware.light.size)
             stack.callback(self._history.destroy)
             light = MonitorDisplay(self._history, lag_s=hardware.lag_ms / 1000.0)
             rig = make_rig(hardware.rig, hardware.rig_options, light)
@@ -97,7 +78,7 @@ class SimulatedHardware:
             self.peers = self._started(rig, light, stack)
             self._stack = stack.pop_all()
 
-    def _started(self, rig: Rig, light: Light, stack: ExitStack) -> list[PeerProcess]:
+    def _started(self, rig: Rig, light: MonitorDisplay, stack: ExitStack) -> list[PeerProcess]:
         hardware = self._hardware
         if len(hardware.addresses) != len(rig.cameras):
             raise StartupError(
@@ -133,25 +114,21 @@ class SimulatedHardware:
                 f"The rig file {path} can't be written ({error.strerror}): choose another name."
             ) from error
 
-    def run(self, ended: Callable[[float], bool]) -> None:
-        """Look at the monitor until told to end.
-
-        Parameters
-        ----------
-        ended
-            Waits for so many seconds at most and says whether to end.
+    def run(self, ended: Ended) -> None:
+        """Light the scene until told to end.
 
         Raises
         ------
         StartupError
-            If a camera's process ended by itself.
+            If a camera's process ended by itself, or the light can't be had.
         """
-        watch(
-            self._screen.gray,
-            self._history,
-            looks_per_s=self._hardware.looks_per_s,
-            ended=lambda left_s: ended(left_s) or self._refuse_dead(),
+        self._hardware.light.run(
+            self._history, self._fire, lambda left_s: ended(left_s) or self._refuse_dead()
         )
+
+    def _fire(self, number: int, time_s: float, shown_us: float) -> None:
+        for process in self.peers:
+            process.fire(number, time_s, shown_us)
 
     def _refuse_dead(self) -> bool:
         for process in self.peers:
@@ -168,48 +145,43 @@ class SimulatedHardware:
 
 def rig_file(rig: Rig, hardware: Hardware) -> dict[str, Any]:
     """Write the rig file of simulated hardware: the exact calibration, the sensors' true facts."""
-    facts, calibration, monitor = rig.facts(), rig.calibration(), hardware.monitor
+    facts, calibration, light = rig.facts(), rig.calibration(), hardware.light
+    wiring = {"trigger_line": light.trigger_line} if light.trigger_line else {}
+    cameras = {
+        name: {
+            "driver": "aravis",
+            "address": address,
+            **wiring,
+            "sensor": {
+                "bit_depth": camera.bit_depth,
+                "black_level_gray": float(camera.black_level_gray),
+                "full_well_e": float(camera.full_well_e),
+                "read_noise_e": float(camera.read_noise_e),
+            },
+        }
+        for (name, camera), address in zip(facts.cameras.items(), hardware.addresses, strict=False)
+    }
     gamma = facts.projector.gamma if facts.projector else 1.0
     document: dict[str, Any] = {
         "title": f"Simulated hardware: {rig.info.model}",
-        "cameras": {
-            name: {
-                "driver": "aravis",
-                "address": address,
-                **hardware.camera_options,
-                "sensor": {
-                    "bit_depth": camera.bit_depth,
-                    "black_level_gray": float(camera.black_level_gray),
-                    "full_well_e": float(camera.full_well_e),
-                    "read_noise_e": float(camera.read_noise_e),
-                },
-            }
-            for (name, camera), address in zip(
-                facts.cameras.items(), hardware.addresses, strict=False
-            )
-        },
-        "projector": {
-            "driver": "page",
-            "page": hardware.page,
-            "size": f"{monitor.width_px}x{monitor.height_px}",
-            "refresh_hz": hardware.refresh_hz,
-            "gamma": gamma,
-        },
+        "cameras": cameras,
+        "projector": {**light.entry, "gamma": gamma},
     }
     if calibration is not None and calibration.projector is not None:
-        document["calibration"] = _calibration(calibration)
+        document["calibration"] = _calibration(calibration, projector=not wiring)
     RigFile.of(document, "of the simulated hardware")
     return document
 
 
-def _calibration(calibration: RigCalibration) -> dict[str, Any]:
+def _calibration(calibration: RigCalibration, *, projector: bool) -> dict[str, Any]:
+    """Write where the devices are; a projector whose mirrors stand on their corners has no model here."""
     written: dict[str, Any] = {
         "cameras": {
             name: _view(model, calibration.camera_from_world[name])
             for name, model in calibration.cameras.items()
         }
     }
-    if calibration.projector is not None and calibration.projector_from_world is not None:
+    if projector and calibration.projector and calibration.projector_from_world:
         written["projector"] = _view(calibration.projector, calibration.projector_from_world)
     return written
 

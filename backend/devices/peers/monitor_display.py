@@ -123,19 +123,34 @@ class MonitorHistory:
         self.__dict__.update(state)
         self._map()
 
-    def note(self, gray: UInt8[np.ndarray, "h w"], time_s: float) -> None:
-        """Take one look: kept if it differs from the last one. Only one process does this.
+    def note(
+        self, gray: UInt8[np.ndarray, "h w"], time_s: float, since_s: float | None = None
+    ) -> int:
+        """Take one look: kept if it differs from the last one. Only one process does this. Return the frame's number.
 
-        When between the two looks it changed isn't known: half way is right on average.
+        Parameters
+        ----------
+        gray
+            What is shown.
+        time_s
+            When it was looked at, in [s] of `time.monotonic()`.
+        since_s
+            Since when it is shown; None: not known, then half way between the two looks, which is right on average.
         """
         count, before_s = int(self._header["count"]), float(self._header["looked_s"])
         if count == 0 or not np.array_equal(self._frames[(count - 1) % _KEPT], gray):
             slot = count % _KEPT
             self._header["numbers"][slot] = -1  # whoever reads it now notices
             self._frames[slot] = gray
-            self._header["since_s"][slot] = time_s if count == 0 else (before_s + time_s) / 2
+            middle_s = time_s if count == 0 else (before_s + time_s) / 2
+            self._header["since_s"][slot] = middle_s if since_s is None else since_s
             self._header["numbers"][slot] = count
             self._header["count"] = count + 1
+        self._header["looked_s"] = time_s
+        return int(self._header["count"]) - 1
+
+    def unchanged(self, time_s: float) -> None:
+        """Note that nothing has changed until now."""
         self._header["looked_s"] = time_s
 
     @property
@@ -204,12 +219,19 @@ class MonitorDisplay:
         known: dict[int, Shown] = {}
         parts: list[tuple[Shown, float]] = []
         for number, share in self._history.shown(start_s, end_s):
-            known[number] = self._known.get(number) or self._shown(number)
+            known[number] = self._known.get(number) or self.held(number)
             parts.append((known[number], share))
         self._known = known
         return tuple(parts)
 
-    def _shown(self, number: int) -> Shown:
+    def held(self, number: int) -> Shown:
+        """Return one frame that stays, whatever is shown next: what a trigger line fired for.
+
+        Raises
+        ------
+        DeviceDisconnected
+            If it isn't remembered any more.
+        """
         frame = self._history.frame(number)
         if frame is None:
             raise DeviceDisconnected(

@@ -1,24 +1,32 @@
 """Cameras of a simulated rig on the network, a process each: rendering one never delays the other's packets."""
 
 import errno
+import logging
 import multiprocessing
 import signal
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
+from backend.devices.errors import DeviceError
 from backend.devices.options import read_options
 from backend.devices.peers.gige_camera import GigECamera, Wire
+from backend.devices.peers.monitor_display import MonitorDisplay
+from backend.devices.protocols import Camera
 from backend.devices.sim import (
     SimulatedLcdConfig,
     SimulatedLcdRig,
     SimulatedRig,
     SimulatedRigConfig,
 )
+from backend.devices.sim.camera import SimulatedCamera
 from backend.devices.sim.renderer import Light
 from backend.domain.errors import StartupError, UnglareError
+
+log = logging.getLogger(__name__)
 
 _START_S = 300.0
 """So long a large scene may take to be cast."""
@@ -55,7 +63,7 @@ def make_rig(
 class PeerProcess:
     """A process that serves one camera; it ends with this object's `stop`, and with the process that made it."""
 
-    def __init__(self, peer: Peer, light: Light) -> None:
+    def __init__(self, peer: Peer, light: MonitorDisplay) -> None:
         self.peer = peer
         context = multiprocessing.get_context("spawn")
         self._told, theirs = context.Pipe()
@@ -83,6 +91,11 @@ class PeerProcess:
             raise StartupError(
                 f"The simulated camera {self.peer.camera} at {self.peer.address} can't start: {problem}"
             )
+
+    def fire(self, number: int, time_s: float, shown_us: float) -> None:
+        """Fire the camera's trigger line: a frame of the light is shown from a time on, for so long."""
+        with suppress(OSError):  # a camera that is gone isn't triggered
+            self._told.send((number, time_s, shown_us))
 
     @property
     def is_alive(self) -> bool:
@@ -112,17 +125,18 @@ class PeerProcess:
             self._process.join()
 
 
-def _serve(peer: Peer, light: Light, told: Connection) -> None:
-    """Serve until the other end of the pipe is closed."""
+def _serve(peer: Peer, light: MonitorDisplay, told: Connection) -> None:
+    """Serve, and fire the trigger line, until the other end of the pipe is closed."""
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # Ctrl+C is for who started this, and ends it in order
     try:
         _warm_up(peer)
         rig = make_rig(peer.rig, peer.options, light)
-        with rig, GigECamera(rig.cameras[peer.camera], peer.address, peer.wire):
+        camera = rig.cameras[peer.camera]
+        with rig, GigECamera(camera, peer.address, peer.wire):
             told.send("")
-            _wait_for_end(told)
+            _fire_until_end(camera, light, told)
     except UnglareError as error:
         _tell(told, error.sentence)
     except OSError as error:
@@ -138,11 +152,18 @@ def _warm_up(peer: Peer) -> None:
         camera.get_frame()
 
 
-def _wait_for_end(told: Connection) -> None:
-    try:
-        told.recv()
-    except (EOFError, OSError):
-        return
+def _fire_until_end(camera: Camera, light: MonitorDisplay, told: Connection) -> None:
+    while True:
+        try:
+            number, time_s, shown_us = told.recv()
+        except (EOFError, OSError):
+            return
+        if not isinstance(camera, SimulatedCamera):
+            continue
+        try:
+            camera.line_edge(light.held(number), time_s, shown_us)
+        except DeviceError as error:  # exposed for too long, or far too late
+            log.warning("An edge of the trigger line had no effect: %s", error)
 
 
 def _tell(told: Connection, problem: str) -> None:
