@@ -36,7 +36,7 @@ from backend.devices.pattern_set import NewPattern, PatternSet, write_set
 from backend.devices.peers.dlpc350 import SimulatedDlpc350, load_ms
 from backend.devices.protocols import Frame, LinkState, Rig, SequenceProjector, TriggerSource
 from backend.devices.rig_shelf import RigShelf
-from backend.domain.patterns import Sine, Uniform
+from backend.domain.patterns import Gray, Sine, Uniform
 from backend.jobs.rendering import render
 from tests.lightcrafter_hardware import lightcrafter_hardware
 
@@ -230,6 +230,27 @@ def test_images_that_load_too_slowly_are_refused_with_the_period_that_works(tmp_
 
 def test_fringes_along_the_columns_load_at_once(flash):
     assert max(load_ms(image) for image in flash) < 1.0
+
+
+def test_black_and_white_sets_run_bit_by_bit_and_fast(tmp_path):
+    """24 patterns from one image, at a period that 8 bits couldn't have."""
+    codes = [
+        Gray(bit=bit, bits=10, codes=912, inverse=i) for bit in range(10) for i in (False, True)
+    ]
+    pictures = [render(code, width_px=WIDTH, height_px=HEIGHT) for code in codes]
+    write_set(tmp_path, [NewPattern(p, "code") for p in (*pictures, even(255), even(0))], pack=True)
+    flash = PatternSet.read(tmp_path).image_pictures(tmp_path)
+    assert len(flash) == 1
+    bench = Bench()
+    with SimulatedDlpc350(bench, flash) as device, projector_of(device, tmp_path) as projector:
+        assert projector.capabilities.bit_depths == (1,)
+        projector.load(pictures)
+        projector.arm_sequence(range(20), 2000, 2500)
+        projector.start_sequence()
+        ran(device)
+    assert len(bench.lit) == 20
+    for picture, wanted in zip(bench.lit, pictures, strict=True):
+        np.testing.assert_array_equal(picture, wanted)
 
 
 # ---------------------------------------------------------------- single patterns

@@ -10,10 +10,9 @@ from backend.devices import dlpc350_protocol as protocol
 from backend.devices.drivers.aravis_library import AravisMissingError, aravis
 from backend.devices.pattern_set import NewPattern, write_set
 from backend.domain.patterns import BLACK, WHITE, Pattern
-from backend.domain.rig import ProjectorFacts
+from backend.domain.rig import ProjectorFacts, RigCalibration
 from backend.domain.states import StageStatus
 from backend.jobs.rendering import render
-from backend.services.simulated_hardware import _calibration
 from backend.stages.exposures import ExposuresParams, _design
 from tests.lightcrafter_hardware import lightcrafter_hardware
 from tests.scans.houses import real_house, run_unattended, stage_of
@@ -32,6 +31,22 @@ def stored(folder: Path, *patterns: Pattern) -> Path:
     pictures = [render(p, width_px=WIDTH, height_px=HEIGHT) for p in patterns]
     write_set(folder, [NewPattern(p, "pattern") for p in pictures], pack=True)
     return folder
+
+
+def written(calibration: RigCalibration) -> dict[str, object]:
+    """Write a calibration as a rig file has it."""
+    views = {
+        name: {
+            "width_px": model.width_px,
+            "height_px": model.height_px,
+            "K": model.K.tolist(),
+            "distortion": model.distortion.tolist(),
+            "R": calibration.camera_from_world[name].R.tolist(),
+            "t_mm": calibration.camera_from_world[name].t_mm.tolist(),
+        }
+        for name, model in calibration.cameras.items()
+    }
+    return {"cameras": views}
 
 
 def test_a_scan_plays_from_flash_and_every_frame_comes(tmp_path, worker_id):
@@ -57,7 +72,7 @@ def test_a_scan_plays_from_flash_and_every_frame_comes(tmp_path, worker_id):
             "patterns": str(folder),
             "transport": f"unix:{tmp_path / 'lcr'}",
         }
-        rig = {"cameras": cameras, "projector": projector, "calibration": _calibration(calibration)}
+        rig = {"cameras": cameras, "projector": projector, "calibration": written(calibration)}
         data = tmp_path / "data"
         (data / "rigs").mkdir(parents=True)
         (data / "rigs" / "bench.yaml").write_text(yaml.safe_dump(rig))
