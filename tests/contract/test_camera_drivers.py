@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from backend.devices.assembled import AssembledRig, SensorFacts
 from backend.devices.conformance import RigConformance
 from backend.devices.driver_loading import CAMERAS, load_factory, make_camera
 from backend.devices.drivers import aravis_library, gentl_camera, video_camera
+from backend.devices.drivers.extras import imported
 from backend.devices.drivers.pylon_camera import PylonCamera
 from backend.devices.drivers.sfnc import SfncControls, SfncOptions
 from backend.devices.drivers.video_camera import VideoCamera, VideoOptions
@@ -30,6 +32,8 @@ from backend.devices.errors import (
     RigConfigError,
     UnsupportedFeature,
 )
+from backend.devices.peers import genicam as peer_features
+from backend.devices.peers.gvsp import PIXEL_FORMATS
 from backend.devices.protocols import Camera, CameraSettings, LinkState, Range, TriggerSource
 from backend.devices.sim.clock import Clock
 from backend.devices.sim.lcd_config import SimulatedLcdConfig
@@ -269,6 +273,65 @@ def test_a_camera_that_was_given_back_can_be_opened_by_another():
             camera.arm()
             camera.get_frame()
     assert not gentl_camera._producers
+
+
+def nodes_in_memory() -> tuple[Any, list[tuple[int, bytes]], object]:
+    """Let GenICam's own reader have a camera whose registers are bytes in memory; its writes are listed.
+
+    The port comes last: whoever reads keeps it, GenICam doesn't.
+    """
+    genapi = imported("left", "genicam.genapi", "gentl")
+    memory, writes = bytearray(1 << 17), []
+
+    class Port(genapi.AbstractPort):  # type: ignore[misc,name-defined]  # of a library without types
+        def is_open(self) -> bool:
+            return True
+
+        def get_access_mode(self) -> int:
+            return int(genapi.EAccessMode.RW)
+
+        def read(self, address: int, length: int) -> bytes:
+            return bytes(memory[address : address + length])
+
+        def write(self, address: int, value: bytes) -> None:
+            memory[address : address + len(value)] = value
+            writes.append((address, bytes(value)))
+
+    formats = {name: PIXEL_FORMATS[name] for name in ("Mono8", "Mono12")}
+    exposures, gains = Range(20.0, 1e6, 1.0, "us"), Range(0.0, 24.0, 0.1, "dB")
+    described = peer_features.describe(
+        peer_features.CameraDescription(
+            "Maker", "Camera", formats, ["Software", "Line1"], exposures, gains, Range(576, 9000, 4)
+        )
+    )
+    nodes, port = genapi.NodeMap(), Port()
+    nodes.load_xml_from_string(described.decode())
+    nodes.connect(port, "Device")
+    nodes.get_node("PixelFormat").value = "Mono8"
+    nodes.get_node("ExposureTime").value = 1000.0
+    return nodes, writes, port
+
+
+def test_a_producers_camera_takes_exposure_gain_format_and_trigger():
+    """The features that `viky` lacks, through GenICam's own reader of descriptions."""
+    viky()
+    nodes, writes, _port = nodes_in_memory()
+    features = gentl_camera.GentlFeatures(nodes)
+    made = SfncControls("left", features, SfncOptions(), buffered_frames=3, hardware_timestamp=True)
+    made.prepare()
+    can = made.capabilities()
+    assert can.exposure_us == Range(20.0, 1e6, 0.0, "us")
+    assert can.gain_db == Range(0.0, 24.0, 0.0, "dB")
+    assert can.pixel_formats == ("Mono8", "Mono12")
+    assert can.trigger_sources == (TriggerSource.SOFTWARE, TriggerSource.LINE1, TriggerSource.FREE_RUN)  # fmt: skip
+    for wanted in (
+        CameraSettings(2500.5, 6.0, "Mono12", None, TriggerSource.LINE1),
+        CameraSettings(2500.5, 0.0, "Mono8", None, TriggerSource.FREE_RUN),
+        CameraSettings(700.0, 0.0, "Mono8", None, TriggerSource.SOFTWARE),
+    ):
+        assert made.apply(wanted, made.read()) == wanted
+    features.run("TriggerSoftware")
+    assert writes[-1] == (peer_features.TRIGGER_SOFTWARE.address, (1).to_bytes(4))
 
 
 # ---------------------------------------------------------------- video
