@@ -165,6 +165,9 @@ new ResizeObserver((entries) => {
   }, { once: true });
 })();
 
+// Two fingers zoom without changing either.
+if (window.visualViewport) visualViewport.addEventListener("resize", tellGeometry);
+
 // Neither keys nor wheel may zoom what is projected.
 addEventListener("keydown", (event) => {
   if ((event.ctrlKey || event.metaKey) && ["+", "-", "=", "0"].includes(event.key)) event.preventDefault();
