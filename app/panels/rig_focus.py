@@ -48,6 +48,7 @@ class FocusPanel:
         """Another rig, or none: what was best doesn't count any more."""
         self._start_anew()
         self._put_away()
+        self._chart.clear()
 
     def show(self, live: LiveView, cameras: list[str]) -> None:
         """Show what the newest pictures say."""
@@ -60,7 +61,7 @@ class FocusPanel:
         known = {c.camera: c for c in live.cameras}
         content = "".join(self._card(i, name, known.get(name)) for i, name in enumerate(cameras))
         if not cameras:
-            content = markup.div("ug-empty", "No pictures: the rig isn't connected.")
+            content = markup.div("ug-empty", "No pictures while the rig isn't connected.")
         self._cards.content = content + (self._foot() if cameras else "")
 
     def choose(self, camera: str, x: int, y: int) -> None:

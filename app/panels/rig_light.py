@@ -134,7 +134,8 @@ class LightPanel:
             return ""
         periods = settings.exposure_ms / period_ms
         is_whole = abs(periods - round(periods)) < 1e-3
-        words = f"{number(round(periods, 2) if not is_whole else round(periods))} × {number(period_ms)} ms period of the projector"
+        count = number(round(periods) if is_whole else round(periods, 2))
+        words = f"{count} {'period' if count == '1' else 'periods'} of {number(period_ms)} ms"
         css = "ug-setting-note ug-examples" if is_whole else "ug-setting-note"
         return markup.div(css, markup.esc(words if is_whole else f"{words}: may flicker"))
 

@@ -1,5 +1,6 @@
 """Gray levels of live pictures: one line per camera over the whole range."""
 
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from app.views.curve import axes
 
 _HEIGHT_PX = 138
 _BINS = 256
+_UNFOLDING_S = 0.7
 _TOP = 6.6
 """log10 of four million pixels."""
 
@@ -28,16 +30,25 @@ class LevelsChart:
         self._place = gui.add_folder(None)
         self._chart: Any = None
         self._cameras: tuple[str, ...] | None = None
+        self._not_before_s = 0.0
 
     def show(self, cameras: Sequence[str], histograms: Mapping[str, Sequence[int]]) -> None:
         """Draw the counts of each camera; without any, nothing changes."""
-        if not histograms:
+        if not histograms or time.monotonic() < self._not_before_s:
             return
         if tuple(cameras) != self._cameras:
             self._make(tuple(cameras))
         none = np.zeros(_BINS)
         lines = [np.log10(1.0 + np.asarray(histograms.get(c, none), np.float64)) for c in cameras]
         self._chart.data = (np.arange(_BINS, dtype=np.float64), *lines)
+
+    def clear(self) -> None:
+        """Take the chart away: another rig comes, or the page was closed."""
+        if self._chart is not None:
+            self._chart.remove()
+        self._chart, self._cameras = None, None
+        # A chart that is made while its page unfolds measures a width of 0 and never writes its x axis.
+        self._not_before_s = time.monotonic() + _UNFOLDING_S
 
     def _make(self, cameras: tuple[str, ...]) -> None:
         if self._chart is not None:

@@ -93,7 +93,7 @@ def test_a_typed_exposure_snaps_and_moves_the_levels(page: Desk) -> None:
     set_exposure(page, "17", "16.67")
     before = mean_gray(page)
     set_exposure(page, "35", "33.33")
-    expect(page.page.locator(".ug-setting-note", has_text="2 × 16.67 ms")).to_be_visible()
+    expect(page.page.locator(".ug-setting-note", has_text="2 periods of 16.67 ms")).to_be_visible()
     wait_for(page, lambda: mean_gray(page) > 1.7 * before)
 
 
