@@ -27,7 +27,9 @@ from backend.numerics.sync_checks import (
 
 SET_LIMIT = 0.08
 """Share of the light that a set moves by which a frame may deviate: a display that is one pattern late deviates by 25 %."""
-PAIR_LIMIT = 0.12
+PAIR_LIMIT = 0.25
+"""The same for a pattern and its inverse, one of which is shown where the other should be: 70 %. What spills over from
+saturated pixels doesn't add up."""
 MARKER_LIMIT = 0.05
 WHITE_LEAST = 0.3
 """White may be so much darker than expected: a camera's tone curve isn't known."""

@@ -6,6 +6,7 @@ import threading
 import numpy as np
 import pytest
 
+from backend.devices.drivers import page_projector
 from backend.devices.drivers.page_projector import PageOptions, PageProjector
 from backend.devices.errors import (
     DeviceBusy,
@@ -152,3 +153,85 @@ def test_rates_and_times_that_cant_be_are_refused(options: dict[str, float]) -> 
     name, value = next(iter(options.items()))
     with pytest.raises(RigConfigError, match=f"option {name} can't be {value}"):
         read_options(PageOptions, "projector", {"size": "64x48", **options})
+
+
+# ---------------------------------------------------------------- refresh rate and latency
+
+
+def opened_with(
+    desk: PageDesk, period_ms: float | None = 16.667, **options: object
+) -> PageProjector:
+    browser = Browser(desk)
+    browser.page.told(json.dumps({"t": "geometry", **GEOMETRY, "refresh_period_ms": period_ms}))
+    projector = PageProjector(
+        "projector", read_options(PageOptions, "projector", {"size": "64x48", **options}), desk
+    )
+    projector.open()
+    return projector
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "hz"),
+    [
+        (16.6667, 60.0),
+        (16.683, 59.94),
+        (16.71, 59.84),
+        (13.332, 75.0),
+        (6.9443, 144.0),
+        (20.9, 47.85),
+    ],
+)
+def test_the_rate_is_the_one_the_page_measured(desk: PageDesk, period_ms: float, hz: float) -> None:
+    projector = opened_with(desk, period_ms)
+    assert projector.capabilities.refresh_hz == hz
+    assert projector.remarks == ()
+
+
+def test_what_the_file_says_counts_but_a_wrong_rate_is_told(desk: PageDesk) -> None:
+    projector = opened_with(desk, 16.667, refresh_hz=75.0)
+    assert projector.capabilities.refresh_hz == 75.0
+    assert projector.remarks == (
+        "The projector page draws 60 times a second, the rig's file says 75 Hz: correct refresh_hz or leave it out, or"
+        " exposures don't fit the screen's frames.",
+    )
+    projector.close()
+    assert opened_with(PageDesk(), 16.683, refresh_hz=60.0).remarks == (), "0.1 % is nothing"
+
+
+def test_a_page_that_cant_measure_is_told(desk: PageDesk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_projector, "_REFRESH_S", 0.01)
+    projector = opened_with(desk, None)
+    assert projector.capabilities.refresh_hz == 60.0
+    assert "couldn't measure" in projector.remarks[0]
+
+
+LATENCY = {"settle_ms": 84.0, "exposure_ms": 16.667, "refresh_hz": 60.0, "screen": " at 0,0"}
+
+
+@pytest.mark.parametrize(
+    ("change", "remark"),
+    [
+        ({}, None),
+        ({"screen": ""}, None),
+        ({"refresh_hz": None}, None),
+        ({"screen": "1280x800 at 1280,0"}, "on another screen"),
+        ({"refresh_hz": 75.0}, "at 75 Hz, now the screen has 60 Hz"),
+    ],
+)
+def test_a_latency_holds_for_its_screen_and_rate(
+    desk: PageDesk, change: dict[str, object], remark: str | None
+) -> None:
+    projector = opened_with(desk, measured={**LATENCY, **change})
+    if remark is None:
+        assert (projector.settle_ms, projector.settle_exposure_ms) == (84.0, 16.667)
+        assert projector.remarks == ()
+    else:
+        assert (projector.settle_ms, projector.settle_exposure_ms) == (None, None)
+        assert remark in projector.remarks[0]
+        assert "measure it again" in projector.remarks[0]
+
+
+def test_a_settle_time_in_the_file_counts_more(desk: PageDesk) -> None:
+    projector = opened_with(desk, settle_ms=0.0, measured={**LATENCY, "screen": "elsewhere"})
+    assert projector.settle_ms == 0.0
+    assert projector.remarks == ()
