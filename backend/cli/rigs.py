@@ -1,7 +1,7 @@
 """`unglare rigs`: which rigs this station has, the files that describe them, and whether a rig works."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -11,9 +11,7 @@ from backend.cli.discovering import discover
 from backend.cli.house import Monitor, open_services
 from backend.cli.options import AsJson, DataFolder
 from backend.cli.output import answering, console, quiet_logging, table
-
-if TYPE_CHECKING:
-    from backend.devices.rig_shelf import RigShelf
+from backend.cli.rig_files import calibration, open_shelf, show, template
 
 
 def register(application: typer.Typer) -> None:
@@ -26,6 +24,9 @@ def register(application: typer.Typer) -> None:
     group.command("list")(list_rigs)
     group.command("add")(add)
     group.command("remove")(remove)
+    group.command("show")(show)
+    group.command("template")(template)
+    group.command("calibration")(calibration)
     group.command("check")(check_rig)
     group.command("conform")(conform)
     group.command("latency")(latency)
@@ -56,7 +57,7 @@ def add(
     """Check a rig file and keep it; scans can then be made with --rig NAME."""
     quiet_logging()
     with answering(as_json) as answer:
-        kept = _shelf(data).add(file, name)
+        kept = open_shelf(data).add(file, name)
         answer.update({"name": kept.name, "path": str(kept.path)})
         if not as_json:
             console().print(
@@ -72,7 +73,7 @@ def remove(
     """Take a rig file away; it is renamed, not deleted."""
     quiet_logging()
     with answering(as_json) as answer:
-        left = _shelf(data).remove(name)
+        left = open_shelf(data).remove(name)
         answer.update({"name": name, "path": str(left)})
         if not as_json:
             console().print(f"rig {name} is no longer offered; its file is {left}")
@@ -92,7 +93,7 @@ def latency(
 
     quiet_logging()
     with answering(as_json) as answer:
-        shelf = _shelf(data)
+        shelf = open_shelf(data)
         shelf.require(rig)
         with open_services(data, rig=rig, monitor=monitor) as services:
             found = measure_latency(
@@ -111,11 +112,3 @@ def latency(
 
 def _say_progress(done: float, text: str = "") -> None:
     typer.echo(f"{100 * done:3.0f} %  {text}", err=True)
-
-
-def _shelf(data: Path | None) -> "RigShelf":
-    from backend.devices.pages import PageDesk
-    from backend.devices.rig_shelf import RigShelf
-    from backend.settings import load_settings
-
-    return RigShelf(load_settings(data_folder=data).rig_folder, PageDesk())

@@ -1,11 +1,11 @@
 """The rigs of one station: built in, from packages, and the files in its folder."""
 
 import re
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
 from pydantic import BaseModel, ConfigDict
 
 from backend.devices.errors import RigConfigError, RigNotFoundError
@@ -13,8 +13,11 @@ from backend.devices.loading import available_rigs, open_rig
 from backend.devices.options import DisplaySize
 from backend.devices.pages import PageDesk
 from backend.devices.protocols import Rig
-from backend.devices.rig_file import RigFile, assemble
+from backend.devices.rig_file import CalibrationEntry, RigFile, assemble, read_yaml
 
+CALIBRATION_SUFFIX = ".calibration.yaml"
+"""Beside a rig's file: where its devices are, if the file doesn't say it itself."""
+_NAMED_CALIBRATION = re.compile(r"^calibration:[ \t]*[^\s{#][^\n]*$", re.MULTILINE)
 LATENCY_SUFFIX = ".latency.json"
 """Beside a rig's file: what the latency calibration found."""
 ASSUMED_REFRESH_HZ = 60.0
@@ -98,7 +101,57 @@ class RigShelf:
             raise RigConfigError(
                 f"rig {name} is described by {path} and takes no options, but got {', '.join(options)}; edit the file"
             )
-        return assemble(name, self._with_latency(name, RigFile.read(path)), self._desk)
+        return assemble(name, self._with_latency(name, self.read(name)), self._desk)
+
+    def read(self, name: str) -> RigFile:
+        """Read a rig's file, and the calibration beside it.
+
+        Raises
+        ------
+        RigNotFoundError, RigConfigError
+            If there is none, or it can't be used.
+        """
+        file = RigFile.read(self.require(name))
+        beside = self.calibration_path(name)
+        if file.calibration is not None or not beside.is_file():
+            return file
+        document = {**file.model_dump(mode="json"), "calibration": read_yaml("calibration", beside)}
+        return RigFile.of(document, f"{self._folder / name}.yaml with {beside.name}")
+
+    def calibration_path(self, name: str) -> Path:
+        """Return where a rig's calibration is kept if its file doesn't hold it."""
+        return self._folder / f"{name}{CALIBRATION_SUFFIX}"
+
+    def keep_calibration(self, name: str, entry: CalibrationEntry, source: str) -> Path:
+        """Keep a calibration beside a rig's file, in place of the one before.
+
+        Raises
+        ------
+        RigNotFoundError
+            If there is no rig file of this name.
+        RigConfigError
+            If the file holds a calibration itself, or the new one is for other cameras.
+        """
+        path, file = self.require(name), RigFile.read(self.require(name))
+        if file.calibration is not None:
+            raise RigConfigError(
+                f"rig file {path} holds a calibration itself; take that entry out of it first"
+            )
+        RigFile.of(
+            {**file.model_dump(mode="json"), "calibration": entry.model_dump(mode="json")},
+            str(path),
+        )
+        return self._write_calibration(name, entry, source)
+
+    def _write_calibration(self, name: str, entry: CalibrationEntry, source: str) -> Path:
+        text = yaml.safe_dump(
+            entry.model_dump(mode="json"), sort_keys=False, default_flow_style=None
+        )
+        path = self.calibration_path(name)
+        path.write_text(
+            f"# from {source}; x_device = R x_world + t_mm in mm, as OpenCV has it\n{text}"
+        )
+        return path
 
     def _with_latency(self, name: str, file: RigFile) -> RigFile:
         """Let the projector wait as long as was measured, unless its entry says how long or has changed since."""
@@ -145,11 +198,18 @@ class RigShelf:
             raise RigConfigError(
                 f"there is a rig {name!r} already; remove it first, or choose another name"
             )
-        assemble(name, RigFile.read(source), self._desk)
+        file = RigFile.read(source)
+        assemble(name, file, self._desk)
         target = self._folder / f"{name}.yaml"
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
+            text = source.read_text("utf-8")
+            named = _NAMED_CALIBRATION.search(text)
+            if named is not None and file.calibration is not None:
+                # The name of a file counts from where the rig file was: here it would lead nowhere.
+                self._write_calibration(name, file.calibration, str(source))
+                text = text.replace(named.group(), f"# calibration: see {name}{CALIBRATION_SUFFIX}")
+            target.write_text(text, "utf-8")
         except OSError as error:
             raise RigConfigError(
                 f"rig file {target} can't be written ({error.strerror}); check the data folder's rights and space"
@@ -157,18 +217,19 @@ class RigShelf:
         return KeptRig(name, target)
 
     def remove(self, name: str) -> Path:
-        """Take a file off the shelf, and its latency, which needn't hold for the next rig of that name.
+        """Take a file off the shelf, and calibration and latency, which needn't hold for the next rig of that name.
 
-        Both are renamed, not deleted; the rig's is returned.
+        They are renamed, not deleted; the rig's is returned.
 
         Raises
         ------
         RigNotFoundError
             If there is none of this name.
         """
-        path, latency = self.require(name), self._latency_path(name)
-        if latency.exists():
-            latency.rename(latency.with_name(f"{latency.name}.removed"))
+        path = self.require(name)
+        for beside in (self._latency_path(name), self.calibration_path(name)):
+            if beside.exists():
+                beside.rename(beside.with_name(f"{beside.name}.removed"))
         return path.rename(path.with_suffix(".yaml.removed"))
 
     def require(self, name: str) -> Path:
