@@ -98,7 +98,7 @@ class Shooter:
     def way_out(self) -> str:
         """What helps if frames don't show what they were taken for."""
         return (
-            f"measure the latency of its display (`unglare rigs latency {self._rig.name}`) or raise the projector's"
+            f"measure the latency of its display (`unglare rigs latency --rig {self._rig.name}`) or raise the projector's"
             " settle_ms"
         )
 

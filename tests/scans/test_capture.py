@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from backend.devices.errors import DeviceDisconnected, DeviceError, DeviceTimeout, IncompleteFrame
+from backend.devices.errors import (
+    DeviceDisconnected,
+    DeviceError,
+    DeviceTimeout,
+    FeatureError,
+    IncompleteFrame,
+)
+from backend.devices.protocols import CameraSettings, TriggerSource
 from backend.devices.protocols import Frame as DeviceFrame
 from backend.domain.errors import (
     CancelledError,
@@ -38,7 +45,15 @@ from backend.jobs.rendering import render
 from backend.jobs.shooting import Shooter
 from backend.storage.artifacts import LocalArtifactStore
 from backend.storage.rows import FrameRow
-from tests.scans.toy import Faults, FringesParams, ToyRig, fringe_plan, wait_plan
+from tests.scans.toy import (
+    ABILITIES,
+    Faults,
+    FringesParams,
+    ToyCamera,
+    ToyRig,
+    fringe_plan,
+    wait_plan,
+)
 
 
 class MemoryJournal:
@@ -298,6 +313,61 @@ def test_cancelled_while_a_lost_device_is_waited_for(bench: Bench) -> None:
         bench.drive(fringe_plan(FRINGES))
     assert time.monotonic() - began < 5.0
     assert len(bench.journal) == 2
+
+
+FREE = replace(ABILITIES, trigger_sources=(TriggerSource.FREE_RUN,), buffered_frames=2)
+
+
+class FreeCamera(ToyCamera):
+    """Runs freely: three frames after each new pattern still show the one before."""
+
+    stale = 0
+    shot = 0
+    last: np.ndarray | None = None
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        assert settings.trigger is TriggerSource.FREE_RUN
+        return super().configure(settings)
+
+    def trigger(self) -> None:
+        raise FeatureError(self.name, "runs freely")
+
+    def get_frame(self, timeout_s: float = 2.0) -> DeviceFrame:
+        self.frames += 1
+        frame = super().get_frame(timeout_s)
+        if self.rig.shots != self.shot:
+            self.shot, self.stale, self.early = self.rig.shots, 3, self.last
+        self.stale -= 1
+        late = self.stale >= 0 and self.early is not None
+        self.last = frame.data
+        return replace(frame, data=self.early) if late else frame
+
+
+def test_cameras_that_run_freely_throw_early_frames_away(bench: Bench) -> None:
+    (expected,) = bench.drive(fringe_plan(FRINGES))
+    free = Bench(bench.store)
+    free.rig.cameras["left"] = FreeCamera("left", free.rig, capabilities=FREE)
+    free.rig.open()
+    (frames,) = free.drive(fringe_plan(FRINGES))
+    for one, other in zip(frames, expected, strict=True):
+        np.testing.assert_array_equal(one.gray, other.gray)
+    assert free.rig.cameras["left"].frames == 8 * 4
+    assert free.rig.shots == 8
+
+
+def test_a_frame_that_comes_twice_is_taken_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = bench.rig.cameras["left"]
+
+    def again(shot: int) -> None:
+        if shot == 3:
+            camera.frames -= 1
+
+    bench.faults.before_shot = again
+    (frames,) = bench.drive(fringe_plan(FRINGES))
+    assert len(frames) == 16
+    assert bench.rig.shots == 8 + 1
 
 
 def test_cancelled_between_two_shots(bench: Bench) -> None:
