@@ -2,9 +2,10 @@
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -61,6 +62,11 @@ class _RealTime:
 @runtime_checkable
 class Flashing(Protocol):
     """What is asked of a projector here; every `Projector` can do it."""
+
+    @property
+    def name(self) -> str:
+        """For sentences."""
+        ...
 
     @property
     def capabilities(self) -> ProjectorCapabilities:
@@ -176,6 +182,7 @@ def measure_latency(
                 progress,
                 repetitions=repetitions,
                 clock=clock,
+                ask=lease.threads.call,
             )
         )
 
@@ -187,17 +194,28 @@ def latency_of(
     *,
     repetitions: int,
     clock: Clock | None = None,
+    ask: Callable[[str, str, Callable[[], Any]], Any] = lambda device, doing, call: call(),
 ) -> Latency:
-    """Measure the latency of an opened projector by opened cameras that see its light."""
-    return _Bench(projector, cameras, clock or _RealTime()).measure(repetitions, progress)
+    """Measure the latency of an opened projector by opened cameras that see its light.
+
+    `ask` calls their drivers: on threads of their own where a call may never return.
+    """
+    return _Bench(projector, cameras, clock or _RealTime(), ask).measure(repetitions, progress)
 
 
 class _Bench:
     """Projector and cameras while the latency is measured."""
 
-    def __init__(self, projector: Flashing, cameras: Sequence[Taking], clock: Clock) -> None:
+    def __init__(
+        self,
+        projector: Flashing,
+        cameras: Sequence[Taking],
+        clock: Clock,
+        ask: Callable[[str, str, Callable[[], Any]], Any],
+    ) -> None:
         self._projector = projector
         self._clock = clock
+        self._ask = ask
         self._cameras = tuple(cameras)
         # As the projector tells it: the rig's file is compared with what is kept, to the last bit.
         self._refresh_hz = projector.capabilities.refresh_hz or ASSUMED_REFRESH_HZ
@@ -221,8 +239,8 @@ class _Bench:
             if hasattr(projector, "settle_ms"):
                 projector.settle_ms = known
             for camera in self._cameras:
-                camera.disarm()
-            projector.blank()
+                self._ask(camera.name, "disarming", camera.disarm)
+            self._blank(0)
         return self._latency(changes[255], changes[0])
 
     def _shortest_exposure(self) -> float:
@@ -232,23 +250,28 @@ class _Bench:
 
     def _arm(self) -> None:
         for camera in self._cameras:
-            camera.configure(
-                replace(
-                    camera.settings,
-                    exposure_us=round(self._exposure_ms * 1000.0, 3),
-                    trigger=TriggerSource.SOFTWARE,
-                )
+            wanted = replace(
+                camera.settings,
+                exposure_us=round(self._exposure_ms * 1000.0, 3),
+                trigger=TriggerSource.SOFTWARE,
             )
-            camera.arm()
+            self._ask(camera.name, "setting its exposure", partial(camera.configure, wanted))
+            self._ask(camera.name, "arming", camera.arm)
+
+    def _blank(self, level: int) -> None:
+        self._ask(self._projector.name, "showing a pattern", lambda: self._projector.blank(level))
 
     def _pictures(self, level: int, delay_s: float) -> list[Gray]:
         """Show a level, wait from its acknowledgement on, and take one picture with each camera."""
-        self._projector.blank(level)
+        self._blank(level)
         acknowledged_s = self._clock.now_s()
         self._clock.sleep(max(0.0, delay_s - (self._clock.now_s() - acknowledged_s)))
         for camera in self._cameras:
-            camera.trigger()
-        return [_gray(camera) for camera in self._cameras]
+            self._ask(camera.name, "being triggered", camera.trigger)
+        return [
+            _gray(self._ask(camera.name, "taking a picture", camera.get_frame))
+            for camera in self._cameras
+        ]
 
     def _refuse_darkness(self, steady: Mapping[int, list[Gray]]) -> None:
         for camera, dark, bright in zip(self._cameras, steady[0], steady[255], strict=True):
@@ -286,7 +309,7 @@ class _Bench:
         self, target: int, steady: Mapping[int, list[Gray]], delay_ms: float
     ) -> list[float]:
         start = 255 - target
-        self._projector.blank(start)
+        self._blank(start)
         self._clock.sleep(_STEADY_S)
         pictures = self._pictures(target, delay_ms / 1000.0)
         return [
@@ -311,9 +334,8 @@ class _Bench:
         )
 
 
-def _gray(camera: Taking) -> Gray:
+def _gray(frame: Frame) -> Gray:
     """Return a picture on the scale of 8 bits, whatever the camera's depth."""
-    frame = camera.get_frame()
     return np.asarray(frame.data * (_FULL_SCALE_GRAY / (2**frame.bits - 1)), np.float64)
 
 

@@ -11,6 +11,7 @@ from backend.devices.protocols import Camera, DeviceInfo, Frame, Remarks, Rig
 from backend.domain.patterns import BLACK, WHITE
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.jobs.control import JobControl
+from backend.jobs.device_threads import DeviceThreads
 from backend.jobs.rendering import render
 from backend.jobs.rigs import Owner
 from backend.jobs.shooting import Shooter
@@ -74,14 +75,14 @@ def try_rig(
         If the rig can't be opened, is busy, or a device fails: the sentence names it.
     """
     with context.rigs.lease(name, options, Owner("", "check", who)) as lease:
-        return lease.call(lambda rig: _try(name, rig))
+        return lease.call(lambda rig: _try(name, rig, lease.threads))
 
 
-def _try(name: str, rig: Rig) -> RigTrial:
+def _try(name: str, rig: Rig, threads: DeviceThreads) -> RigTrial:
     facts, calibration = rig.facts(), rig.calibration()
     devices = tuple(_devices(rig))
     try:
-        frames = _frames(rig, facts)
+        frames = _frames(rig, facts, threads)
     except DeviceError as error:
         return RigTrial(
             name, _who(rig.info), devices, (), _calibration_words(calibration), (error.sentence,)
@@ -124,11 +125,11 @@ def _who(info: DeviceInfo) -> str:
     return " ".join(word for word in words if word)
 
 
-def _frames(rig: Rig, facts: RigFacts) -> tuple[TestFrame, ...]:
+def _frames(rig: Rig, facts: RigFacts, threads: DeviceThreads) -> tuple[TestFrame, ...]:
     low_ms = max(c.exposure_min_ms for c in facts.cameras.values())
     high_ms = min(c.exposure_max_ms for c in facts.cameras.values())
     exposure_ms = float(np.clip(_EXPOSURE_MS, low_ms, high_ms))
-    with Shooter(rig, JobControl()) as shooter:
+    with Shooter(rig, JobControl(), threads) as shooter:
         width_px, height_px = shooter.projector_size
         shooter.load([render(p, width_px=width_px, height_px=height_px) for p in (WHITE, BLACK)])
         white, black = (

@@ -40,6 +40,8 @@ class VirtualTime:
 class LaggingScreen:
     """Acknowledges at once, and changes `lag_s` later."""
 
+    name = "projector"
+
     def __init__(self, lag_s: float, clock: VirtualTime, refresh_hz: float = 240.0) -> None:
         self.capabilities = ProjectorCapabilities(size=(64, 48), refresh_hz=refresh_hz)
         self.lag_s, self.clock = lag_s, clock
