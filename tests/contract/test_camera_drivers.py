@@ -1,7 +1,9 @@
 """One conformance suite over every camera driver that can run here, and what each has besides."""
 
 import ctypes
+import fcntl
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -205,13 +207,16 @@ def fake_camera(address: str) -> Iterator[None]:
     except OSError as error:
         pytest.skip(str(error))
     library.arv_gv_fake_camera_new.restype = ctypes.c_void_p
-    camera = ctypes.c_void_p(library.arv_gv_fake_camera_new(address.encode(), b"FAKE1"))
-    try:
-        if not library.arv_gv_fake_camera_is_running(camera):
-            pytest.skip(f"another program has the GigE Vision port of {address}")
-        yield
-    finally:
-        library.g_object_unref(camera)
+    # Its address is one that every machine has, and two of them would share the port without a word.
+    with (Path(tempfile.gettempdir()) / "unglare-tests-aravis.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        camera = ctypes.c_void_p(library.arv_gv_fake_camera_new(address.encode(), b"FAKE1"))
+        try:
+            if not library.arv_gv_fake_camera_is_running(camera):
+                pytest.skip(f"another program has the GigE Vision port of {address}")
+            yield
+        finally:
+            library.g_object_unref(camera)
 
 
 # ---------------------------------------------------------------- GenTL
