@@ -32,6 +32,8 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+_MOST_WAITING = 4
+"""So many may wait for the answer of one rig at the same time."""
 _CLOSING_S = 15.0
 """How long the application waits for its rigs when it ends."""
 
@@ -160,7 +162,8 @@ class RigPool:
 
     def given(self, name: str, options: Mapping[str, Any]) -> RigGiven:
         """Wait for the facts and the calibration of a rig; raises what `ask` does, DeviceError if a device doesn't answer."""
-        return self.ask(name, options).result()
+        asked = self.ask(name, options)
+        return self._slot(name).answer(asked)
 
     def use(self, name: str, options: Mapping[str, Any], work: Callable[[Rig], T]) -> T:
         """Ask a rig something that takes no pictures (its truth, its devices' names), on its own thread.
@@ -169,7 +172,7 @@ class RigPool:
         """
         slot = self._slot(name)
         slot.refuse_other(options)
-        return slot.opened(options, work).result()
+        return slot.answer(slot.opened(options, work))
 
     @contextmanager
     def lease(
@@ -310,6 +313,7 @@ class _Slot:
         self._thread = RigThread(name, self._forget)
         self._threads: DeviceThreads | None = None
         self._lock = threading.Lock()
+        self._places = threading.Semaphore(_MOST_WAITING)
         self._owner: Owner | None = None
         self._rig: Rig | None = None
         self._options: str | None = None
@@ -401,6 +405,19 @@ class _Slot:
             return work(self._opened_rig())
 
         return self._thread.submit(open_and_work)
+
+    def answer(self, asked: Future[T]) -> T:
+        """Wait for an answer, but not with too many others: each of them holds one of the server's threads."""
+        if asked.done():
+            return asked.result()
+        if not self._places.acquire(blocking=False):
+            raise RigBusyError(
+                f"Rig {self.name!r} doesn't answer yet, and others wait for it already: ask again in a moment."
+            )
+        try:
+            return asked.result()
+        finally:
+            self._places.release()
 
     def discard(self) -> Future[None]:
         return self._thread.submit(self._close)

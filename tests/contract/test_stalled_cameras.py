@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -240,6 +241,26 @@ def test_a_camera_that_doesnt_close_is_left_behind(place: Place) -> None:
     # The old device is stuck still, the new one opens beside it.
     job = place.ended(place.start("sulky"))
     assert job["status"] == "finished", job
+
+
+def test_many_who_wait_for_a_rig_that_hangs_leave_room_for_others(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SulkyCamera, "answers_within_s", 20.0)
+    place.trouble.call = "open"
+
+    def ask(_: int) -> int:
+        return place.client.post("/api/rigs/sulky/view", json={}).status_code
+
+    with ThreadPoolExecutor(24) as crowd:
+        asked = [crowd.submit(ask, number) for number in range(24)]
+        assert place.trouble.reached.wait(20)
+        wait(asked[:20], timeout=0.5)
+        assert place.client.get("/api/health").status_code == 200
+        place.trouble.end()
+    answers = [one.result() for one in asked]
+    assert set(answers) == {200, 409}
+    assert answers.count(200) >= 4
 
 
 def test_ending_the_application_doesnt_wait_for_a_camera(place: Place) -> None:
