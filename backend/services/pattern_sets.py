@@ -85,10 +85,8 @@ class Trial:
 
     stages: Mapping[str, _Shown]
     titles: Mapping[str, str]
-    unreached: tuple[str, ...]
-    """Capturing stages that weren't run, because one before them failed."""
-    reason: str
-    """Why."""
+    unreached: Mapping[str, str]
+    """Capturing stages that weren't run, and why."""
 
 
 def record_trials(services: Services, wanted: Wanted) -> tuple[Trial, Trial]:
@@ -152,8 +150,11 @@ def _trial(services: Services, wanted: Wanted, rig: str, options: dict[str, Any]
     return Trial(
         stages={stage: _shown(documents) for stage, documents in shots.items()},
         titles={stage.name: stage.title for stage in method.stages},
-        unreached=tuple(s.name for s in state.stages if s.name in capturing and _is_unreached(s)),
-        reason=reason,
+        unreached={
+            s.name: reason or s.message
+            for s in state.stages
+            if s.name in capturing and _is_unreached(s)
+        },
     )
 
 
@@ -174,7 +175,7 @@ def _run_through(services: Services, scan: str, request: StartRun) -> tuple[Scan
 
 
 def _is_unreached(stage: StageState) -> bool:
-    return stage.status in (StageStatus.PENDING, StageStatus.FAILED)
+    return stage.status in (StageStatus.UNAVAILABLE, StageStatus.PENDING, StageStatus.FAILED)
 
 
 def _shown(documents: Sequence[Mapping[str, Any]]) -> _Shown:
@@ -216,8 +217,8 @@ def pictures_of(
                 " frames decide on them."
             )
     left_out += [
-        f"{first.titles[name]} ({name}) wasn't reached in the trial, what it shows is missing: {first.reason}"
-        for name in first.unreached
+        f"{first.titles[name]} ({name}) wasn't reached in the trial, what it shows is missing: {reason}"
+        for name, reason in first.unreached.items()
     ]
     patterns = [(_READ.validate_json(text), tuple(names)) for text, names in stages.items()]
     evens = [WHITE, BLACK, *(Uniform(gray=level) for level in wanted.levels)]

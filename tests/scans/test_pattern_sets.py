@@ -115,7 +115,8 @@ def trial(unreached: tuple[str, ...] = (), **stages: tuple[tuple[object, ...], i
         name: _Shown(tuple(p.model_dump_json() for p in patterns), masked)
         for name, (patterns, masked) in stages.items()
     }
-    return Trial(shown, {n: n.title() for n in (*stages, *unreached)}, unreached, "It failed.")
+    titles = {name: name.title() for name in (*stages, *unreached)}
+    return Trial(shown, titles, dict.fromkeys(unreached, "It failed."))
 
 
 FRINGE, OTHER = Sine(periods=4), Sine(periods=5)
