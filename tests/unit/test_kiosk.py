@@ -1,6 +1,8 @@
 """The kiosk: which monitor, which command line, and where the token is kept."""
 
+import os
 import stat
+import time
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,24 @@ def test_the_window_fills_the_monitor_and_the_token_is_no_argument(
     assert command[-1] == door.as_uri()
     assert stat.S_IMODE(door.stat().st_mode) == 0o600
     assert "/projector?name=left+one&amp;token=se%26cret" in door.read_text()
+
+
+def test_the_window_is_closed_behind_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    browser, marks = tmp_path / "chromium", tmp_path / "marks"
+    browser.write_text(f"#!/bin/sh\necho $$ > {marks}\nexec sleep 60\n")
+    browser.chmod(0o755)
+    monkeypatch.setattr("backend.services.kiosk.shutil.which", lambda name: str(browser))
+    deadline_s = time.monotonic() + 20
+    with Kiosk(tmp_path / "kiosk").opened(DESK, "http://127.0.0.1:1", name="wall", token="secret"):
+        while not (marks.exists() and marks.read_text().strip()):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        pid = int(marks.read_text())
+        os.kill(pid, 0)  # it is there
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
 
 
 def test_without_a_browser_the_way_out_is_said(
