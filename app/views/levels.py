@@ -1,6 +1,5 @@
 """Gray levels of live pictures: one line per camera over the whole range."""
 
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,7 +11,6 @@ from app.views.curve import axes
 
 _HEIGHT_PX = 138
 _BINS = 256
-_UNFOLDING_S = 0.7
 _TOP = 6.6
 """log10 of four million pixels."""
 
@@ -30,38 +28,40 @@ class LevelsChart:
         self._place = gui.add_folder(None)
         self._chart: Any = None
         self._cameras: tuple[str, ...] | None = None
-        self._not_before_s = 0.0
+        self._is_odd = False
 
     def show(self, cameras: Sequence[str], histograms: Mapping[str, Sequence[int]]) -> None:
         """Draw the counts of each camera; without any, nothing changes."""
-        if not histograms or time.monotonic() < self._not_before_s:
+        if not histograms:
             return
-        if tuple(cameras) != self._cameras:
-            self._make(tuple(cameras))
         none = np.zeros(_BINS)
         lines = [np.log10(1.0 + np.asarray(histograms.get(c, none), np.float64)) for c in cameras]
-        self._chart.data = (np.arange(_BINS, dtype=np.float64), *lines)
+        data = (np.arange(_BINS, dtype=np.float64), *lines)
+        if tuple(cameras) != self._cameras:
+            self._make(tuple(cameras), data)
+            return
+        # A chart that gets other data while it is being made writes no x axis until the axis changes: let it, always.
+        self._is_odd = not self._is_odd
+        data[0][-1] += 1e-3 * self._is_odd
+        self._chart.data = data
 
     def clear(self) -> None:
         """Take the chart away: another rig comes, or the page was closed."""
         if self._chart is not None:
             self._chart.remove()
         self._chart, self._cameras = None, None
-        # A chart that is made while its page unfolds measures a width of 0 and never writes its x axis.
-        self._not_before_s = time.monotonic() + _UNFOLDING_S
 
-    def _make(self, cameras: tuple[str, ...]) -> None:
+    def _make(self, cameras: tuple[str, ...], data: tuple[Any, ...]) -> None:
         if self._chart is not None:
             self._chart.remove()
         self._cameras = cameras
-        x = np.arange(_BINS, dtype=np.float64)
         series: list[Any] = [
             {"label": name, "stroke": camera_colour(i), "fill": f"{camera_colour(i)}30", "width": 1.2, "points": {"show": False}}
             for i, name in enumerate(cameras)
         ]  # fmt: skip
         with self._place:
             self._chart = self._gui.add_uplot(
-                (x, *(np.zeros(_BINS) for _ in cameras)),
+                data,
                 ({"label": "gray"}, *series),
                 scales={"x": {"time": False}, "y": {"range": (0.0, _TOP)}},
                 axes=axes("gray level, 0 to 255 of full scale", "log₁₀ pixels"),

@@ -42,7 +42,9 @@ class SettlingChart:
         if self._chart is not None:
             self._chart.remove()
         delays = np.array(found.delays_ms)
-        x = np.unique(np.concatenate([delays, found.settle_ms + np.array([-_THIN, 0.0, _THIN])]))
+        around = found.settle_ms + np.array([-_THIN, 0.0, _THIN])
+        reach = 1.08 * max(found.settle_ms, float(delays[-1]))
+        x = np.unique(np.concatenate([delays, around, [reach]]))
         up, down = (np.interp(x, delays, np.array(values)) for values in (found.up, found.down))
         mark = np.where(x == found.settle_ms, 2.0, -1.0)
         with self._chart_place:
@@ -54,7 +56,7 @@ class SettlingChart:
                     _line("white to black", _DOWN, 1.4),
                     {"label": "settle time", "stroke": "rgba(255,255,255,.8)", "width": 1.2, "dash": (4, 3), "points": {"show": False}},
                 ),
-                scales={"x": {"time": False, "range": (0.0, float(x[-1]) * 1.02)}, "y": {"range": (-0.05, 1.1)}},
+                scales={"x": {"time": False, "range": (0.0, reach)}, "y": {"range": (-0.05, 1.1)}},
                 axes=axes("after the acknowledgement [ms]", "share of change"),
                 legend={"show": False}, cursor={"drag": {"x": False, "y": False}},
                 height=_HEIGHT_PX, padding=(8, 14, 0, 0),
