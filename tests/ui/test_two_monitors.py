@@ -4,6 +4,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -155,6 +156,7 @@ def test_injected_lag_is_found_and_the_scan_is_as_good(
     desktop: Desktop, window: Window, station: Station
 ) -> None:
     with simulated(desktop, station, "late", LATE_CAMERAS, "--lag-ms=60"):
+        station.give_page_to("late")
         station.post("/api/rigs/late/latency", repetitions=3)
         wait_for(lambda: station.get("/api/rigs/late/latency"), "the latency calibration")
         found = station.get("/api/rigs/late/latency")
@@ -191,7 +193,7 @@ def test_every_pixel_of_the_second_monitor_is_as_asked(
                    receive({data: new Uint8Array(gray).buffer}); show({id: 1, slot: 0}); }""",
                 [*SIZE, pattern.ravel().tolist()],
             )
-            wait_for(lambda: shows(screen, pattern), "the pattern", 20.0)  # noqa: B023  ends within the loop
+            wait_for(partial(shows, screen, pattern), "the pattern", 20.0)
 
 
 @pytest.mark.parametrize("shot", [4])

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +211,7 @@ class Station:
 
     def __init__(self, desktop: Desktop, folder: Path) -> None:
         self._desktop = desktop
-        self.data = folder
+        self._rigs: set[str] = set()
         self._environment = {
             "UNGLARE_DATA_FOLDER": str(folder),
             "UNGLARE_PORT": "0",
@@ -236,6 +237,17 @@ class Station:
             "rigs-add", "rigs", "add", str(file), "--name", name, **self._environment
         )
         assert added.process.wait(PATIENCE_S) == 0, added.said
+        self._rigs.add(name)
+
+    def give_page_to(self, rig: str) -> None:
+        """Disconnect all other rigs: a page shows the patterns of one rig at a time."""
+        for other in self._rigs - {rig}:
+            address = f"/api/rigs/{other}"
+            self.post(f"{address}/disconnect")
+            wait_for(partial(self._is_disconnected, address), f"the disconnecting of {other}")
+
+    def _is_disconnected(self, address: str) -> bool:
+        return str(self.get(f"{address}/state")["link"]) == "closed"
 
     def get(self, path: str) -> Any:
         """Ask."""
@@ -276,6 +288,7 @@ class Station:
 
     def scan(self, rig: str, **settings: dict[str, Any]) -> "Scan":
         """Make a scan."""
+        self.give_page_to(rig)
         made = self.post("/api/scans", method="hdr-fringe", rig=rig, settings=settings)
         return Scan(self, made["id"])
 
