@@ -443,6 +443,22 @@ def test_validation_is_waited_for_and_its_warnings_pass(device, projector):
     projector.arm_sequence([0], 8333, 8333)
 
 
+def test_a_pattern_whose_start_was_ignored_is_started_again(device, projector, bench):
+    projector.load([even(100)])
+    device.faults.ignored_starts = 1
+    projector.show(0)
+    assert shows(bench, even(100))
+
+
+def test_a_sequence_whose_start_was_ignored_is_told_and_not_started_again(device, projector, bench):
+    projector.load([even(100)])
+    projector.arm_sequence([0] * 100, 8333, 8333)
+    device.faults.ignored_starts = 1
+    with pytest.raises(DeviceTimeout, match="didn't start the sequence"):
+        projector.start_sequence()
+    assert not bench.edges
+
+
 def test_too_few_images_in_flash_are_found_when_opened(folder, flash, bench):
     with SimulatedDlpc350(bench, flash[:4]) as device:
         with pytest.raises(FeatureError, match=r"flash holds 4 images, the set in .* number 10"):

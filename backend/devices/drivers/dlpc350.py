@@ -466,14 +466,17 @@ class Dlpc350Projector(Link):
     def _start(self, duration_s: float | None) -> None:
         """Start, and see that it runs; a sequence that may be over by then is believed.
 
-        Never started a second time: its trigger edges would come twice.
+        What repeats until it is stopped (None) is started again if need be: coming from video, a first start was
+        seen to be ignored. A sequence never is: its trigger edges would come twice.
         """
+        deadline_s = time.monotonic() + _STARTED_S
         self._written(Command.START_STOP, bytes((Action.START,)))
         if duration_s is not None and duration_s < _STARTED_S:
             return
-        deadline_s = time.monotonic() + _STARTED_S
         while self._read(Command.START_STOP)[0] != Action.START:
             self._wait(deadline_s, "didn't start the sequence; try again")
+            if duration_s is None:
+                self._written(Command.START_STOP, bytes((Action.START,)))
 
     def _halt(self) -> None:
         self._written(Command.START_STOP, bytes((Action.STOP,)))
@@ -510,20 +513,21 @@ class Dlpc350Projector(Link):
 def _tables(
     run: _Run, exposure_us: int, period_us: int, *, repeat: bool
 ) -> Iterator[tuple[Command, bytes]]:
-    """Return the commands that describe a sequence, in the order that the guide wants."""
+    """Return the commands that describe a sequence, in the order that TI's own program has: tables last."""
     yield Command.TIMING, protocol.timing_payload(exposure_us, period_us)
     yield (
         Command.SEQUENCE,
         protocol.sequence_payload(len(run.entries), len(run.images), repeat=repeat),
     )
-    yield Command.MAILBOX, bytes((Mailbox.IMAGES,))
-    yield Command.MAILBOX_OFFSET, b"\0"
-    yield Command.MAILBOX_DATA, protocol.image_lut(run.images)
-    yield Command.MAILBOX, bytes((Mailbox.CLOSED,))
-    yield Command.MAILBOX, bytes((Mailbox.PATTERNS,))
-    yield Command.MAILBOX_OFFSET, b"\0"
-    yield Command.MAILBOX_DATA, b"".join(entry.packed() for entry in run.entries)
-    yield Command.MAILBOX, bytes((Mailbox.CLOSED,))
+    patterns = b"".join(entry.packed() for entry in run.entries)
+    for mailbox, data in (
+        (Mailbox.PATTERNS, patterns),
+        (Mailbox.IMAGES, protocol.image_lut(run.images)),
+    ):
+        yield Command.MAILBOX, bytes((mailbox,))
+        yield Command.MAILBOX_OFFSET, b"\0"
+        yield Command.MAILBOX_DATA, data
+        yield Command.MAILBOX, bytes((Mailbox.CLOSED,))
 
 
 def _words(found: Validation) -> str:

@@ -73,6 +73,8 @@ class Faults:
     """What every validation finds besides."""
     busy_polls: int = 0
     """How often a validation says that it isn't through yet."""
+    ignored_starts: int = 0
+    """So many starts are acknowledged, and nothing starts."""
 
 
 @dataclass
@@ -410,6 +412,9 @@ class SimulatedDlpc350:
         if not ready:
             raise ValueError("not before a sequence is validated in pattern mode")
         self._stop_playing()
+        if self.faults.ignored_starts:
+            self.faults.ignored_starts -= 1
+            return
         self._halt.clear()
         self._action = Action.START
         steps, start_s = self._steps(), self._lamp.now_s() + self._preloading_ms() / 1000.0
