@@ -165,9 +165,7 @@ def _options(options: dict[str, Any] | None) -> str:
 
 
 def _show_views(calibration: dict[str, Any]) -> None:
-    rows = table(
-        "calibrated", ">size", ">focal length", ">principal point", ">from the reference"
-    )
+    rows = table("calibrated", ">size", ">focal length", ">principal point", ">from the reference")
     views = {**calibration["cameras"], "projector": calibration["projector"]}
     for name, view in views.items():
         if view is None:
