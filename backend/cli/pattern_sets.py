@@ -58,6 +58,9 @@ def export(
             min=0, max=255, help="Another even field, beside white and black. Repeatable."
         ),
     ] = None,
+    test_patterns: Annotated[
+        bool, typer.Option("--test-patterns", help="Write the test patterns, too.")
+    ] = False,
     pack: Annotated[
         Packing,
         typer.Option(help="24bit: also the images for the flash of a LightCrafter 4500."),
@@ -89,6 +92,7 @@ def export(
             settings=parse_settings(settings),
             gamma=gamma,
             levels=tuple(level or ()),
+            test_patterns=test_patterns,
         )
         refuse_folder(out)
         with (

@@ -39,7 +39,7 @@ from backend.domain.patterns import (
 from backend.domain.states import StageStatus, Verdict
 from backend.jobs.rendering import render
 from backend.numerics.errors import PatternError
-from backend.numerics.test_patterns import test_pattern
+from backend.numerics.test_patterns import TEST_PATTERNS, test_pattern
 from backend.services.export_folder import FolderKind, refuse_foreign, whole_folder
 from backend.services.services import Services
 
@@ -67,6 +67,8 @@ class Wanted:
     """Of the projector."""
     levels: tuple[int, ...] = ()
     """Even fields that are wanted besides black and white."""
+    test_patterns: bool = False
+    """Whether the test patterns are wanted, too."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +224,17 @@ def pictures_of(
     ]
     patterns = [(_READ.validate_json(text), tuple(names)) for text, names in stages.items()]
     evens = [WHITE, BLACK, *(Uniform(gray=level) for level in wanted.levels)]
-    return _merged([*patterns, *((even, ()) for even in evens)], wanted), tuple(left_out)
+    pictures = _merged([*patterns, *((even, ()) for even in evens)], wanted)
+    return (*pictures, *_test_pictures(pictures, wanted)), tuple(left_out)
+
+
+def _test_pictures(known: Sequence[NewPattern], wanted: Wanted) -> Iterator[NewPattern]:
+    """Draw the test patterns as the rig desk shows them, but those that are there already."""
+    hashes = {pattern_hash(new.picture) for new in known}
+    for kind in TEST_PATTERNS if wanted.test_patterns else ():
+        picture = test_pattern(kind, wanted.width_px, wanted.height_px)
+        if pattern_hash(picture) not in hashes:
+            yield NewPattern(picture, f"test pattern {kind}")
 
 
 def _merged(

@@ -154,6 +154,14 @@ def test_levels_and_gamma_are_the_projectors():
     )
 
 
+def test_the_test_patterns_come_after_the_methods_own():
+    wanted = Wanted("toy", 128, 96, test_patterns=True)
+    patterns, _ = pictures_of((trial(a=((FRINGE,), 0)),) * 2, wanted)
+    words = ["checker", "squares", "focus", "lines", "identify"]
+    assert [p.what for p in patterns[3:]] == [f"test pattern {word}" for word in words]
+    np.testing.assert_array_equal(patterns[5].picture, test_pattern("focus", 128, 96))
+
+
 def test_patterns_that_differ_from_scene_to_scene_are_left_out_with_a_sentence():
     first = trial(ramp=((FRINGE, Uniform(gray=3)), 0))
     second = trial(ramp=((FRINGE, Uniform(gray=4)), 0))
