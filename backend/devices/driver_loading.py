@@ -37,6 +37,7 @@ _BUILT_IN = {
     PROJECTORS: {
         "page": f"{_DRIVERS}.page_projector:create_projector",
         "dlpc350": f"{_DRIVERS}.dlpc350:create_projector",
+        "none": f"{_DRIVERS}.no_projector:create_projector",
     },
 }
 

@@ -80,10 +80,17 @@ def _options(schema: dict[str, Any]) -> Iterator[DriverOption]:
         yield DriverOption(
             name=name,
             values=_values(described, schema.get("$defs", {})),
-            default=described.get("default"),
+            default=_default(described),
             required=name in required,
             text=" ".join(str(described.get("description", "")).split()),
         )
+
+
+def _default(described: dict[str, Any]) -> Any:
+    default = described.get("default")
+    if isinstance(default, list | tuple) and _values(described, {}).startswith("size"):
+        return "x".join(map(str, default))
+    return default
 
 
 _WORDS = {"number": "number", "integer": "whole number", "boolean": "true or false"}

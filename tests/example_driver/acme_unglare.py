@@ -42,7 +42,7 @@ _CELLS: dict[str, _Cell] = {}
 
 
 class Options(DeviceOptions):
-    """What a rig file may say of either device; `unglare drivers acme` shows these sentences."""
+    """A camera or projector in one of Acme's boxes."""  # `unglare drivers acme` shows these sentences
 
     cell: str = Field("1", description="Which box it is in.")
     size: Size = Field((64, 48), description="Width and height of its pictures or patterns [px].")
