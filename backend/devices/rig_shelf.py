@@ -96,7 +96,7 @@ class RigShelf:
         """
         path = self._folder / f"{name}.yaml"
         if not (_NAME.fullmatch(name) and path.is_file()):
-            known = [rig.name for rig in (*available_rigs(), *self.kept())]
+            known = [*(r.name for r in available_rigs()), *(r.name for r in self.kept())]
             if ":" not in name and name not in known:
                 raise RigNotFoundError(
                     f"there is no rig {name!r}; choose {', '.join(known)}, or give package.module:factory"
