@@ -43,6 +43,8 @@ from backend.devices.protocols import (
 
 _SOCKET_BUFFER_BYTES = 8 << 20
 """Aravis leaves it at the kernel's default, in which a burst of packets doesn't find room."""
+_RETENTION_US = 400_000
+"""How long a frame waits for packets: Aravis' 100 ms are too few for a machine that is busy."""
 _FEWEST_BUFFERS = 4
 _FREE_RUN_BUFFERS = 3
 """So few that what waits is soon thrown away."""
@@ -212,6 +214,7 @@ class AravisCamera(LibraryCamera):
         self._stream = int(stream)
         if library.plain("arv_camera_is_gv_device", self._camera):
             library.set_number_property(self._stream, b"socket-buffer-size", _SOCKET_BUFFER_BYTES)
+            library.set_number_property(self._stream, b"frame-retention", _RETENTION_US)
         for _ in range(count):
             buffer = library.plain("arv_buffer_new_allocate", payload)
             library.plain("arv_stream_push_buffer", self._stream, buffer)
