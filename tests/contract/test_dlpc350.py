@@ -55,7 +55,7 @@ def fringe(step: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A set of 24 fringes and some even fields: 33 patterns of 8 bit in 11 images."""
     path = tmp_path_factory.mktemp("patterns")
     fields = [
@@ -600,10 +600,16 @@ def test_a_measured_latency_is_waited_for(tmp_path, folder):
         f"cameras: {{left: {{driver: aravis, address: 127.0.0.9}}}}\n{entry}\n"
     )
     shelf = RigShelf(tmp_path, PageDesk())
-    assert shelf.open("bench", {}).projector.settle_ms is None
+    assert _settle_ms(shelf) is None
     kept = {"size": [WIDTH, HEIGHT], "refresh_hz": 120.0048, "settle_ms": 25.0}
     (tmp_path / "bench.latency.json").write_text(json.dumps(kept))
-    assert shelf.open("bench", {}).projector.settle_ms == 25.0
+    assert _settle_ms(shelf) == 25.0
+
+
+def _settle_ms(shelf: RigShelf) -> float | None:
+    projector = shelf.open("bench", {}).projector
+    assert isinstance(projector, Dlpc350Projector)
+    return projector.settle_ms
 
 
 def test_without_a_device_on_usb_it_is_one_sentence(folder):
@@ -677,6 +683,8 @@ def test_a_sequence_brings_every_frame_of_every_camera(addresses, folder):
 
 def _sequence(rig: Rig) -> list[list[Frame]]:
     """Run it, again as a scan does if a packet came too late on a busy machine."""
+    projector = rig.projector
+    assert isinstance(projector, SequenceProjector)
     for attempt in (1, 2, 3):
         for camera in rig.cameras.values():
             camera.disarm()
@@ -684,8 +692,8 @@ def _sequence(rig: Rig) -> list[list[Frame]]:
                 replace(camera.settings, exposure_us=12_000.0, trigger=TriggerSource.LINE1)
             )
             camera.arm(STEPS)
-        rig.projector.arm_sequence(range(STEPS), 16_437.0, 16_667.0)
-        rig.projector.start_sequence()
+        projector.arm_sequence(range(STEPS), 16_437.0, 16_667.0)
+        projector.start_sequence()
         try:
             return [
                 [camera.get_frame(timeout_s=10.0) for _ in range(STEPS)]

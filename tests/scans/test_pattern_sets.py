@@ -11,10 +11,11 @@ from backend.cli.application import run
 from backend.devices.pattern_set import PatternSet, pattern_hash, unpacked
 from backend.devices.sim.display import Display
 from backend.domain.errors import ConflictError
-from backend.domain.patterns import WHITE, Gray, Sine, StaticPicture, Uniform
+from backend.domain.patterns import WHITE, Gray, Pattern, Sine, StaticPicture, Uniform
 from backend.jobs.rendering import render
 from backend.numerics.test_patterns import TEST_PATTERNS, test_pattern
 from backend.services.pattern_sets import (
+    Pack,
     Trial,
     Wanted,
     _Shown,
@@ -69,6 +70,8 @@ def _is_sound(written: PatternSet, folder: Path) -> None:
         assert read.dtype == np.uint8
         assert read.shape == (written.height_px, written.width_px)
         assert pattern_hash(read) == pattern.hash
+        assert pattern.image is not None
+        assert pattern.position is not None
         inside = unpacked(images[pattern.image], pattern.position, written.bit_depth)
         np.testing.assert_array_equal(inside, read)
     assert {path.name for path in folder.iterdir()} == {"patterns.json", *written.files}
@@ -110,7 +113,7 @@ def test_an_unknown_method_is_one_sentence(tmp_path, capsys):
 # ---------------------------------------------------------------- what can be written
 
 
-def trial(unreached: tuple[str, ...] = (), **stages: tuple[tuple[object, ...], int]) -> Trial:
+def trial(unreached: tuple[str, ...] = (), **stages: tuple[tuple[Pattern, ...], int]) -> Trial:
     shown = {
         name: _Shown(tuple(p.model_dump_json() for p in patterns), masked)
         for name, (patterns, masked) in stages.items()
@@ -191,7 +194,7 @@ def test_a_stage_that_was_not_reached_is_said():
 # ---------------------------------------------------------------- the folder
 
 
-def written(folder: Path, *patterns: object, pack: str = "24bit") -> PatternSet:
+def written(folder: Path, *patterns: Pattern, pack: Pack = "24bit") -> PatternSet:
     pictures, left_out = pictures_of((trial(a=(patterns, 0)),) * 2, WANTED)
     return export_patterns(pictures, left_out, WANTED, folder, pack)
 

@@ -56,7 +56,7 @@ def test_answers_survive_the_way_whatever_their_length(length, refused):
             "40 07 06 00 31 1a 17 00 17 07",
         ),
     ],
-    ids=lambda value: value.command.name if isinstance(value, Request) else "",
+    ids=lambda value: Command(value.command).name if isinstance(value, Request) else "",
 )
 def test_messages_are_the_guides(request_, beginning):
     (report,) = request_.reports()
