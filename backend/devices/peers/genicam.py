@@ -119,12 +119,17 @@ def _acquisition(writer: "_Writer", camera: CameraDescription) -> None:
 
 
 def _transport(writer: "_Writer", camera: CameraDescription) -> None:
-    writer.category("TransportLayerControl", ["PayloadSize", "TLParamsLocked", "GevSCPSPacketSize"])
+    writer.category(
+        "TransportLayerControl",
+        ["PayloadSize", "TLParamsLocked", "GevSCPSPacketSize", "GevSCPSFireTestPacket"],
+    )
     writer.integer("PayloadSize", PAYLOAD_SIZE)
     writer.integer("TLParamsLocked", PARAMETERS_LOCKED)
     writer.integer(
         "GevSCPSPacketSize", Register(Bootstrap.PACKET_SIZE), camera.packet_bytes, bits=(31, 16)
     )
+    # Clients that find the largest packet size by themselves look for this feature.
+    writer.command("GevSCPSFireTestPacket", Register(Bootstrap.PACKET_SIZE), bits=(0, 0))
 
 
 class _Writer:
@@ -176,10 +181,10 @@ class _Writer:
         ET.SubElement(node, "pValue").text = f"{name}Register"
         self._register("IntReg", name, register)
 
-    def command(self, name: str, register: Register) -> None:
-        """Add a command."""
+    def command(self, name: str, register: Register, bits: tuple[int, int] | None = None) -> None:
+        """Add a command; `bits` if it is a part of its register."""
         self.add("Command", name, pValue=f"{name}Register", CommandValue=1)
-        self._register("IntReg", name, register)
+        self._register("MaskedIntReg" if bits else "IntReg", name, register, bits)
 
     def text(self, name: str, register: Register) -> None:
         """Add a text of fixed length."""
