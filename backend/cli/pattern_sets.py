@@ -10,7 +10,6 @@ import typer
 from backend.cli.options import AsJson, Quiet, Settings, parse_settings
 from backend.cli.output import ProgressLines, answering, console, quiet_logging, table
 from backend.domain.errors import InvalidSettingError
-from backend.numerics.test_patterns import TEST_PATTERNS
 
 if TYPE_CHECKING:
     from backend.devices.pattern_set import PatternSet
@@ -131,7 +130,11 @@ def _show(written: "PatternSet", folder: Path) -> None:
 
 def draw(
     kind: Annotated[
-        str, typer.Option(help=f"One of {', '.join(TEST_PATTERNS)}.", show_default=False)
+        str,
+        typer.Option(
+            help="One of white, black, checker, squares, focus, lines, identify.",
+            show_default=False,
+        ),
     ],
     projector_size: Size,
     out: Annotated[Path, typer.Option(help="File to write, .png or .bmp.")],
@@ -143,6 +146,7 @@ def draw(
     as_json: AsJson = False,
 ) -> None:
     """Write a test pattern as a picture."""
+    from backend.numerics.test_patterns import TEST_PATTERNS
     from backend.services.pattern_sets import export_test_pattern
 
     quiet_logging()

@@ -14,11 +14,11 @@ import pytest
 
 pytest.register_assert_rewrite("backend.devices.conformance")  # so that a failure says which values
 
-from backend.devices.conformance import RigConformance  # noqa: E402  has to come after the line above
-from backend.devices.loading import open_rig  # noqa: E402
-from backend.devices.pages import PageDesk  # noqa: E402
-from backend.devices.protocols import Rig  # noqa: E402
-from backend.devices.rig_file import RigFile, assemble  # noqa: E402
+from backend.devices.conformance import RigConformance  # noqa: E402  after the line above
+from backend.devices.loading import open_rig  # noqa: E402  after the line above
+from backend.devices.pages import PageDesk  # noqa: E402  after the line above
+from backend.devices.protocols import Rig  # noqa: E402  after the line above
+from backend.devices.rig_file import RigFile, assemble  # noqa: E402  after the line above
 
 MAKE = pytest.StashKey[Callable[[], Rig]]()
 """What makes the rig, where pytest is called by a program."""

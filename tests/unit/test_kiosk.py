@@ -2,6 +2,7 @@
 
 import os
 import stat
+import threading
 import time
 from pathlib import Path
 
@@ -58,7 +59,7 @@ def test_the_window_is_closed_behind_the_command(
     with Kiosk(tmp_path / "kiosk").opened(DESK, "http://127.0.0.1:1", name="wall", token="secret"):
         while not (marks.exists() and marks.read_text().strip()):
             assert time.monotonic() < deadline_s
-            time.sleep(0.01)
+            threading.Event().wait(0.01)
         pid = int(marks.read_text())
         os.kill(pid, 0)  # it is there
     with pytest.raises(ProcessLookupError):
