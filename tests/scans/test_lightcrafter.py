@@ -9,6 +9,9 @@ from backend.contract.requests import CreateScan
 from backend.devices import dlpc350_protocol as protocol
 from backend.devices.drivers.aravis_library import AravisMissingError, aravis
 from backend.devices.pattern_set import NewPattern, write_set
+from backend.devices.peers.dlpc350 import SimulatedDlpc350
+from backend.devices.sim.projector import SimulatedProjector
+from backend.devices.sim.renderer import Shown
 from backend.domain.patterns import BLACK, WHITE, Pattern
 from backend.domain.rig import ProjectorFacts, RigCalibration
 from backend.domain.states import StageStatus
@@ -49,13 +52,16 @@ def written(calibration: RigCalibration) -> dict[str, object]:
     return {"cameras": views}
 
 
-def test_a_scan_plays_from_flash_and_every_frame_comes(tmp_path, worker_id):
+@pytest.mark.parametrize("unplugged_at", [None, 24], ids=["undisturbed", "unplugged"])
+def test_a_scan_plays_from_flash_and_every_frame_comes(tmp_path, worker_id, unplugged_at):
+    """Also where the cable is pulled in the middle of a sequence: the scan takes the device back and goes on."""
     number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 98
     addresses = [f"127.80.{number}.2", f"127.80.{number}.3"]
     fringes = _design(ExposuresParams()).patterns(ProjectorFacts(WIDTH, HEIGHT))
     folder = stored(tmp_path / "set", *fringes, WHITE, BLACK)
     with lightcrafter_hardware(addresses, folder) as (device, simulated):
         device.listen(str(tmp_path / "lcr"))
+        edges = count_edges(simulated.projector, device, unplugged_at)
         calibration = simulated.calibration()
         assert calibration is not None
         cameras = {
@@ -82,7 +88,26 @@ def test_a_scan_plays_from_flash_and_every_frame_comes(tmp_path, worker_id):
             made = services.create_scan(request, "test")
             state = run_unattended(services, made.id)
         assert device.late_images == 0
+        assert device.served_clients == (1 if unplugged_at is None else 2)
     assert {stage.status for stage in state.stages} == {StageStatus.DONE}, state
     assert stage_of(state, "stereo_cloud").message
     assert state.job is not None
     assert state.job.error is None
+    assert len(edges) > len(fringes)
+
+
+def count_edges(
+    lamp: SimulatedProjector, device: SimulatedDlpc350, unplugged_at: int | None
+) -> list[float]:
+    """Note the edges of the trigger line, and pull the cable at one of them."""
+    times_s: list[float] = []
+    fire = lamp.trigger_lines[0]
+
+    def noting(shown: Shown, time_s: float, shown_us: float) -> None:
+        times_s.append(time_s)
+        if len(times_s) == unplugged_at:
+            device.unplug()
+        fire(shown, time_s, shown_us)
+
+    lamp.trigger_lines[0] = noting
+    return times_s

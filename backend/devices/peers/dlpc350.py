@@ -160,6 +160,8 @@ class SimulatedDlpc350:
         self.faults = faults or Faults()
         self.late_images = 0
         """Images that weren't loaded from flash when the sequence wanted them."""
+        self.served_clients = 0
+        """Clients since it was made; a reconnected one counts again."""
         self.registers = _Registers()
         self._lamp = lamp
         self._flash = tuple(flash)
@@ -264,6 +266,7 @@ class SimulatedDlpc350:
             connection.close()
             return False
         self._client = connection
+        self.served_clients += 1
         self._run(lambda: self._answer(connection), "dlpc350-client")
         return True
 
