@@ -176,6 +176,7 @@ class Dlpc350Projector(Link):
             linear=True,
             pixel_layout="diamond",
             trigger_out=True,
+            min_exposure_us=float(protocol.LEAST_EXPOSURE_US[self._set.bit_depth]),
         )
 
     # ------------------------------------------------------------ life
