@@ -74,17 +74,13 @@ class SimulatedHardware:
             stack.callback(self._history.destroy)
             light = MonitorDisplay(self._history, lag_s=hardware.lag_ms / 1000.0)
             rig = make_rig(hardware.rig, hardware.rig_options, light)
+            _refuse_other_counts(rig, hardware.addresses)
             self._file = rig_file(rig, hardware)
             self.peers = self._started(rig, light, stack)
             self._stack = stack.pop_all()
 
     def _started(self, rig: Rig, light: MonitorDisplay, stack: ExitStack) -> list[PeerProcess]:
         hardware = self._hardware
-        if len(hardware.addresses) != len(rig.cameras):
-            raise StartupError(
-                f"{len(rig.cameras)} cameras need as many addresses, {len(hardware.addresses)} are given: use --address"
-                " once for each."
-            )
         peers = []
         for number, (camera, address) in enumerate(
             zip(rig.cameras, hardware.addresses, strict=True)
@@ -143,6 +139,13 @@ class SimulatedHardware:
         self._stack.close()
 
 
+def _refuse_other_counts(rig: Rig, addresses: Sequence[str]) -> None:
+    if len(addresses) != len(rig.cameras):
+        raise StartupError(
+            f"{len(rig.cameras)} cameras need as many addresses, {len(addresses)} are given: use --address once for each."
+        )
+
+
 def rig_file(rig: Rig, hardware: Hardware) -> dict[str, Any]:
     """Write the rig file of simulated hardware: the exact calibration, the sensors' true facts."""
     facts, calibration, light = rig.facts(), rig.calibration(), hardware.light
@@ -159,7 +162,7 @@ def rig_file(rig: Rig, hardware: Hardware) -> dict[str, Any]:
                 "read_noise_e": float(camera.read_noise_e),
             },
         }
-        for (name, camera), address in zip(facts.cameras.items(), hardware.addresses, strict=False)
+        for (name, camera), address in zip(facts.cameras.items(), hardware.addresses, strict=True)
     }
     gamma = facts.projector.gamma if facts.projector else 1.0
     document: dict[str, Any] = {
