@@ -243,6 +243,26 @@ def test_a_camera_that_doesnt_close_is_left_behind(place: Place) -> None:
     assert job["status"] == "finished", job
 
 
+@pytest.mark.parametrize("work", ["trial", "latency"])
+def test_work_at_a_rig_without_a_scan_ends_by_name_too(place: Place, work: str) -> None:
+    def told() -> dict[str, Any]:
+        return dict(place.client.get("/api/rigs/sulky/state").json())
+
+    place.client.post("/api/rigs/sulky/connect", json={})
+    while told()["link"] != "open":
+        threading.Event().wait(0.1)
+    place.trouble.call = "trigger"
+    body = {"repetitions": 3} if work == "latency" else None
+    answer = place.client.post(f"/api/rigs/sulky/{work}", json=body)
+    assert answer.status_code == 202, answer.text
+    while (done := told()["work"])["status"] == "running":
+        threading.Event().wait(0.1)
+    said = " ".join([done["error"] or "", *done["problems"]])
+    assert "left: its driver hasn't come back from" in said, done
+    place.trouble.end()
+    assert place.ended(place.start("sulky"))["status"] == "finished"
+
+
 def test_many_who_wait_for_a_rig_that_hangs_leave_room_for_others(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
