@@ -6,7 +6,7 @@ import multiprocessing
 import signal
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any
@@ -42,7 +42,7 @@ class Peer:
     options: Mapping[str, Any]
     camera: str
     address: str
-    wire: Wire
+    wire: Wire = field(default_factory=Wire)
 
 
 def make_rig(
