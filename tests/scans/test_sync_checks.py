@@ -229,7 +229,10 @@ PERSISTENT: dict[str, tuple[Fault, str]] = {
     "two patterns late": (late(2), "."),
     "a fifth of each exposure late": (mixed(0.2), "black marker"),
     "torn": (torn, "."),
-    "late from the tenth picture on": (always_from(9, late(1)), "shows what was shown before"),
+    "late from the tenth picture on": (
+        always_from(9, late(1)),
+        "shows what was shown before|doesn't show its pattern",
+    ),
     "torn from the tenth picture on": (always_from(9, torn), "fringe frame|code frame"),
 }
 WHAT: dict[str, tuple[Shot, ...]] = {
