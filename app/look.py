@@ -76,6 +76,12 @@ class Look:
         )
 
     @property
+    def first_capturing(self) -> str:
+        """Name of the first stage that takes pictures; where none does, of the one on the screen."""
+        stages = self.method.stages if self.method else ()
+        return next((s.name for s in stages if s.captures), self.stage.name)
+
+    @property
     def draft(self) -> Mapping[str, Any]:
         """Edits of the stage on the screen that are not applied yet."""
         return self.drafts.get(self.stage.name, {})

@@ -6,18 +6,18 @@ long. *Events* listens to the server. viser's own threads only put work into the
 """
 
 import contextlib
-import logging
 import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import httpx
 import viser
 
 from app import markup, theme
 from app.clicks import Clicks
 from app.client import ApiClient, ApiError
+from app.failures import words_of
+from app.keys import Key, add_keys
 from app.look import Look
 from app.panels.audit import AuditPanel
 from app.panels.cloud import CloudPanel
@@ -55,7 +55,6 @@ from backend.contract.requests import (
 from backend.contract.rigs import RigView
 from backend.contract.scans import ScanState
 
-_LOG = logging.getLogger(__name__)
 _WIDE_PX = 1500
 """A canvas at least so wide on arrival gets wide panels."""
 _LARGE_PX = 2000
@@ -90,7 +89,7 @@ class Session:
         self._showing_by_itself = False
         self._left_by_hand = ""
         """Scan whose enlarged picture the operator closed: it doesn't come back by itself."""
-        self._rig_desk: RigDeskPanel | None = None
+        self._ends: list[Callable[[], None]] = []
         self._stopping = threading.Event()
         self._acts = Worker(f"acts {client.client_id}", self._report)
         self._loads = Worker(f"loads {client.client_id}", self._report)
@@ -106,8 +105,8 @@ class Session:
         self._acts.close()
         self._loads.close()
         self._rigs.close()
-        if self._rig_desk is not None:
-            self._rig_desk.end()
+        for end in self._ends:
+            end()
         self.api.close()
 
     # ---- what panels ask for (see app/desk.py)
@@ -185,11 +184,11 @@ class Session:
 
     def part_moved(self) -> None:
         """Ask whether to take all pictures again."""
-        self.act(
-            lambda: ask_part_moved(
-                self._gui, lambda reason: self.act(lambda: self._redo_all(reason))
-            )
-        )
+
+        def redo(reason: str) -> None:
+            self.act(lambda: self._redo_all(reason))
+
+        self.act(lambda: ask_part_moved(self._gui, redo))
 
     def export(self) -> None:
         """Ask where to write the results."""
@@ -265,16 +264,14 @@ class Session:
         self._rig_desk = RigDeskPanel(
             client, self._space, self, main=self._rig_controls, left=self._rig_panel
         )
+        self._ends.append(self._rig_desk.end)
         self._new_scan: NewScanPanel | None = None
         with self._home:
             if self.who.may_operate:
                 self._new_scan = NewScanPanel(gui, self)
             else:
-                gui.add_html(
-                    markup.div(
-                        "ug-empty", "You watch. As soon as a scan is worked on, it appears here."
-                    )
-                )
+                words = "You watch. As soon as a scan is worked on, it appears here."
+                gui.add_html(markup.div("ug-empty", words))
         if self.who.may_operate:
             self._add_commands()
             self._listen_to_clicks()
@@ -299,7 +296,7 @@ class Session:
             self._settings = SettingsPanel(gui, self) if self.who.may_operate else None
 
     def _add_commands(self) -> None:
-        keys: list[tuple[str, str, str | None, Callable[[], None]]] = [
+        keys: list[Key] = [
             ("Accept, run, or whatever the large button says", "F", None, self.do_primary),
             ("Apply changed settings", "O", None, self.apply),
             ("Take the pictures of this stage again", "R", None, self.redo),
@@ -309,9 +306,7 @@ class Session:
             ("All scans", "H", None, self.go_home),
             ("Rig without a scan: live pictures, light, focus", "L", None, self._show_present_rig),
         ]
-        for label, key, modifier, work in keys:
-            command = self._gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # keys as viser lists them
-            _on_trigger(command, work)
+        add_keys(self._gui, keys)
 
     def _listen_to_clicks(self) -> None:
         @self._client.scene.on_click()
@@ -325,7 +320,7 @@ class Session:
         self._look = None
         if self.who.may_operate is False and self._follow_newest():
             return
-        self._close_rig()
+        self._rig_desk.close()
         with self._client.atomic():
             self._scan.visible = self._scan_panel.visible = False
             self._home.visible = self._list_panel.visible = True
@@ -350,7 +345,7 @@ class Session:
     def _open(self, scan: ScanState) -> None:
         is_other = self._look is None or self._look.scan.id != scan.id
         method = self._methods.get(scan.method)
-        self._close_rig()
+        self._rig_desk.close()
         if is_other:
             self.load(self._clear_scene)
         self._look = Look(scan, method, may_operate=self.who.may_operate)
@@ -360,9 +355,6 @@ class Session:
             self._scan.visible = self._scan_panel.visible = True
 
     def _open_rig(self, rig: str, options: dict[str, Any] | None) -> None:
-        desk = self._rig_desk
-        if desk is None:
-            return
         if options is None:
             options = self._new_scan.options_of(rig) if self._new_scan is not None else {}
         self._look = None
@@ -370,11 +362,7 @@ class Session:
             self._home.visible = self._list_panel.visible = False
             self._scan.visible = self._scan_panel.visible = False
         self._clear_scene()
-        desk.open(rig, self.api.rigs(), options)
-
-    def _close_rig(self) -> None:
-        if self._rig_desk is not None and self._rig_desk.rig is not None:
-            self._rig_desk.close()
+        self._rig_desk.open(rig, self.api.rigs(), options)
 
     def _show_present_rig(self) -> None:
         """Show the rig of the scan on the screen, or the one that is chosen on the start page."""
@@ -490,13 +478,8 @@ class Session:
         look = self._look
         if look is None:
             return
-        capturing = (
-            next((s.name for s in look.method.stages if s.captures), look.stage.name)
-            if look.method
-            else look.stage.name
-        )
         request = RedoStage(all=True, reason=reason, revision=look.scan.revision)
-        scan = self.api.redo(look.scan.id, capturing, request)
+        scan = self.api.redo(look.scan.id, look.first_capturing, request)
         self._take(self.api.run(scan.id, StartRun()), follow=True)
 
     def _stop(self) -> None:
@@ -546,16 +529,14 @@ class Session:
 
     def _ask_export(self) -> None:
         look = self._look
-        if look is not None:
-            scan_id = look.scan.id
-            ask_export(
-                self._gui,
-                self,
-                scan_id,
-                lambda folder, frames: self.act(
-                    lambda: self._export(scan_id, folder, frames=frames)
-                ),
-            )
+        if look is None:
+            return
+        scan_id = look.scan.id
+
+        def export(folder: str, frames: bool) -> None:
+            self.act(lambda: self._export(scan_id, folder, frames=frames))
+
+        ask_export(self._gui, self, scan_id, export)
 
     def _export(self, scan_id: str, folder: str, *, frames: bool) -> None:
         request = ExportScan(folder=folder, frames=frames)
@@ -623,21 +604,16 @@ class Session:
 
     def _show_rig(self) -> None:
         chosen = self._new_scan.chosen_rig() if self._new_scan is not None else None
-        is_elsewhere = self._look is not None or self._is_at_rig()
-        if is_elsewhere or chosen is None:
+        if self._look is not None or self._rig_desk.is_open or chosen is None:
             return
         name, options = chosen
-        with contextlib.suppress(
-            ApiError
-        ):  # half-typed options: what is wrong is said when it counts
+        # Half-typed options: what is wrong is said when it counts.
+        with contextlib.suppress(ApiError):
             rig = self.api.rig(name, options)
             self.load(lambda: self._draw_rig(rig), key="rig")
 
-    def _is_at_rig(self) -> bool:
-        return self._rig_desk is not None and self._rig_desk.rig is not None
-
     def _draw_rig(self, rig: RigView) -> None:
-        if self._look is None and not self._is_at_rig():
+        if self._look is None and not self._rig_desk.is_open:
             self._rig.show(rig, "")
 
     def _inspect(self, camera: str) -> None:
@@ -680,9 +656,8 @@ class Session:
 
     def _clicked(self, origin: Any, direction: Any) -> None:
         look = self._look
-        if self._rig_desk is not None and self._rig_desk.rig is not None:
+        if self._rig_desk.is_open:
             self._rig_desk.click(origin, direction)
-            return
         if look is None:
             return
         if self._inspector.is_open:
@@ -726,20 +701,18 @@ class Session:
                 self._rig_changed(event.rig)
 
     def _rig_changed(self, rig: str) -> None:
-        desk = self._rig_desk
-        if desk is not None and self._is_at_rig():
-            desk.changed(rig)
+        if self._rig_desk.is_open:
+            self._rig_desk.changed(rig)
         else:
             self.show_rig()
 
     def _follow_rig(self, rig: str) -> None:
         """Show a viewer the rig that somebody sets up: a viewer has no controls to choose it."""
-        desk, look = self._rig_desk, self._look
-        if desk is None or (look is not None and look.running):
+        if self._look is not None and self._look.running:
             return
         live = self.api.live(rig)
-        if desk.rig == rig:
-            desk.changed(rig)
+        if self._rig_desk.rig == rig:
+            self._rig_desk.changed(rig)
             if not live.running:
                 self._go_home()
         elif live.running and live.owner is None:
@@ -782,19 +755,7 @@ class Session:
     def _report(self, error: Exception) -> None:
         if self._stopping.is_set():
             return
-        if isinstance(error, ApiError):
-            self.notify("Not done", error.problem.detail, colour="red")
-        elif isinstance(error, httpx.HTTPError):
-            self.notify(
-                "No answer", "The server doesn't answer; trying again when it does.", colour="red"
-            )
-        else:
-            _LOG.error("defect in the user interface", exc_info=error)
-            self.notify(
-                "Defect",
-                f"The user interface failed: {error}. See the station's log.",
-                colour="red",
-            )
+        self.notify(*words_of(error), colour="red")
 
 
 def _pinned(look: Look, stage: str | None) -> Look:
@@ -804,9 +765,3 @@ def _pinned(look: Look, stage: str | None) -> Look:
 
 def _decision(verdict: str, reason: str, *, proceed: bool) -> Decide:
     return Decide.model_validate({"verdict": verdict, "reason": reason, "proceed": proceed})
-
-
-def _on_trigger(command: viser.CommandHandle, work: Callable[[], None]) -> None:
-    @command.on_trigger
-    async def _(_: Any) -> None:
-        work()

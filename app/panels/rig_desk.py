@@ -68,6 +68,11 @@ class RigDeskPanel:
         """Name of the rig on the screen; None: the page is closed."""
         return self._poll.target
 
+    @property
+    def is_open(self) -> bool:
+        """True while a rig is on the screen."""
+        return self.rig is not None
+
     # ---- what the session asks for
 
     def open(self, rig: str, offers: tuple[RigOffer, ...], options: dict[str, Any]) -> None:
@@ -86,8 +91,10 @@ class RigDeskPanel:
             self.do(lambda: self._desk.api.connect(rig, options))
 
     def close(self) -> None:
-        """Leave the page."""
+        """Leave the page, if it is on the screen."""
         with self._lock:
+            if not self.is_open:
+                return
             self._poll.turn_to(None)
             self._main.visible = self._left.visible = False
             self._focus.forget()

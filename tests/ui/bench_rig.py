@@ -46,6 +46,7 @@ class BenchProjector(Link):
         super().__init__("projector", DeviceInfo("bench", "late screen", "P-1", "bench"))
         self.capabilities = ProjectorCapabilities(size=SCREEN, refresh_hz=60.0)
         self.settle_ms = settle_ms
+        self._closed = threading.Event()
         self._loaded: tuple[UInt8[np.ndarray, "h w"], ...] = ()
         self._changes: list[tuple[float, UInt8[np.ndarray, "h w"]]] = [(0.0, _even(0))]
 
@@ -84,7 +85,7 @@ class BenchProjector(Link):
     def _change(self, index: int, picture: UInt8[np.ndarray, "h w"]) -> Presented:
         self._need_link()
         self._changes.append((time.monotonic() + LAG_S, picture))
-        time.sleep((self.settle_ms or 0.0) / 1000.0)
+        self._closed.wait((self.settle_ms or 0.0) / 1000.0)
         return Presented(index, time.monotonic(), None, confirmed=self.settle_ms is not None)
 
 
