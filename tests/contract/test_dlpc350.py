@@ -640,7 +640,7 @@ else:
 def addresses(worker_id: str) -> tuple[str, str]:
     """Two addresses that no other test process uses: all of 127.0.0.0/8 is this machine."""
     number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 99
-    return f"127.78.{number}.2", f"127.78.{number}.3"
+    return f"127.81.{number}.2", f"127.81.{number}.3"
 
 
 @contextmanager
