@@ -40,7 +40,8 @@ def mixed(share: float) -> Fault:
 
     def fault(asked: Sequence[Picture], count: int) -> Picture:
         now = asked[-1].astype(np.float64)
-        return np.rint((1 - share) * now + share * before(asked)).astype(np.uint8)
+        mixture: Picture = np.rint((1 - share) * now + share * before(asked)).astype(np.uint8)
+        return mixture
 
     return fault
 
@@ -70,7 +71,8 @@ def fading(per_picture: float) -> Fault:
     """Let the lamp fade."""
 
     def fault(asked: Sequence[Picture], count: int) -> Picture:
-        return np.rint(asked[-1] * (1 - per_picture * count)).astype(np.uint8)
+        faded: Picture = np.rint(asked[-1] * (1 - per_picture * count)).astype(np.uint8)
+        return faded
 
     return fault
 
@@ -103,7 +105,8 @@ class DoubtfulProjector:
 
     @property
     def capabilities(self) -> ProjectorCapabilities:
-        return replace(self.inner.capabilities, certain=False, sequence=False)
+        can: ProjectorCapabilities = self.inner.capabilities
+        return replace(can, certain=False, sequence=False)
 
     def open(self) -> None:
         self.inner.open()
@@ -149,7 +152,9 @@ class DoubtfulRig:
         self, fault: Fault = right, *, comes_to_rest: bool = False, **options: object
     ) -> None:
         self._rig = create_rig(options)
-        self.projector = DoubtfulProjector(self._rig.projector, fault, comes_to_rest=comes_to_rest)
+        self.projector: Any = DoubtfulProjector(
+            self._rig.projector, fault, comes_to_rest=comes_to_rest
+        )
         self.name = "doubtful"
 
     @property

@@ -324,6 +324,7 @@ class FreeCamera(ToyCamera):
     stale = 0
     shot = 0
     last: np.ndarray | None = None
+    early: np.ndarray | None = None
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         assert settings.trigger is TriggerSource.FREE_RUN
@@ -338,9 +339,10 @@ class FreeCamera(ToyCamera):
         if self.rig.shots != self.shot:
             self.shot, self.stale, self.early = self.rig.shots, 3, self.last
         self.stale -= 1
-        late = self.stale >= 0 and self.early is not None
         self.last = frame.data
-        return replace(frame, data=self.early) if late else frame
+        if self.stale < 0 or self.early is None:
+            return frame
+        return replace(frame, data=self.early)
 
 
 def test_cameras_that_run_freely_throw_early_frames_away(bench: Bench) -> None:

@@ -74,7 +74,8 @@ class _Recorder(_Around):
 
     @property
     def capabilities(self) -> ProjectorCapabilities:
-        return replace(self.inner.capabilities, max_sequence=self._most, certain=self._certain)
+        can: ProjectorCapabilities = self.inner.capabilities
+        return replace(can, max_sequence=self._most, certain=self._certain)
 
     def arm_sequence(self, indices: Sequence[int], exposure_us: float, period_us: float) -> None:
         self.runs.append((len(indices), exposure_us, period_us))

@@ -32,7 +32,7 @@ from tests.scans.doubtful import (
 )
 from tests.scans.test_capture import MemoryJournal
 
-SMALL = {"scene": "plane", "size": "160x120", "projector_size": "320x200"}
+SMALL: dict[str, Any] = {"scene": "plane", "size": "160x120", "projector_size": "320x200"}
 PERIOD_MS = 1000 / 120
 
 WITNESSES = 2
@@ -87,7 +87,7 @@ def _plan(bursts: tuple[tuple[Shot, ...], ...]) -> Plan[list[Exposed]]:
 
 
 @contextmanager
-def bench_of(store: LocalArtifactStore, fault: Fault = right, **options: object) -> Iterator[Bench]:
+def bench_of(store: LocalArtifactStore, fault: Fault = right, **options: Any) -> Iterator[Bench]:
     with DoubtfulRig(fault, **{**SMALL, **options}) as rig:
         yield Bench(rig, store)
 
@@ -148,7 +148,7 @@ def _methods() -> dict[str, tuple[tuple[Shot, ...], ...]]:
 
 
 METHODS = _methods()
-SCENES: dict[str, dict[str, object]] = {
+SCENES: dict[str, dict[str, Any]] = {
     "plane": {},
     "metal": {"scene": "metal"},
     "high contrast": {"scene": "high-contrast"},

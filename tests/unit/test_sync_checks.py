@@ -23,12 +23,12 @@ def seen(light: np.ndarray, *, noise: float = 1.0, seed: int = 0) -> np.ndarray:
     """Return what a camera makes of projected light in 0..1."""
     rng = np.random.default_rng(seed)
     gray = 8 + ALBEDO * (10 + 120 * light) + rng.normal(0, noise, SHAPE)
-    return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(gray), 0, 255).astype(np.uint8))
 
 
 def fringe(step: float, steps: int, *, periods: float = 10.0, gamma: float = 1.0) -> np.ndarray:
     phase = 2 * np.pi * (periods * X / SHAPE[1] + step / steps)
-    return (0.5 + 0.5 * np.cos(phase)) ** gamma
+    return np.asarray((0.5 + 0.5 * np.cos(phase)) ** gamma)
 
 
 def samples(grays: list[np.ndarray]) -> list[FrameSample]:
