@@ -80,7 +80,8 @@ class BenchProjector(Link):
             for (at, picture), after in zip(changes, times, strict=True)
         ]
         total = sum(part for part, _ in parts) or 1.0
-        return np.sum([picture * (part / total / 255.0) for part, picture in parts if part], axis=0)
+        seen = [picture * (part / total / 255.0) for part, picture in parts if part]
+        return np.asarray(np.sum(seen, axis=0), np.float64)
 
     def _change(self, index: int, picture: UInt8[np.ndarray, "h w"]) -> Presented:
         self._need_link()
@@ -161,7 +162,8 @@ class BenchCamera(Link):
         gain = 10 ** (self.settings.gain_db / 20)
         gray = _GRAY_PER_MS * 1e3 * exposure_s * gain * self._wall * light
         noisy = gray + (0.8 + 0.05 * np.sqrt(gray)) * self._random.standard_normal(gray.shape)
-        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        gray8: UInt8[np.ndarray, "h w"] = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        return gray8
 
 
 class BenchRig:

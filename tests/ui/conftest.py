@@ -104,6 +104,7 @@ def make_scan(served: Served) -> Callable[..., Scan]:
     def make(method: str = "hdr-fringe", name: str = "") -> Scan:
         title = name or f"Part {next(_NUMBERS)}"
         state = served.services.create_scan(CreateScan(method=method, name=title), "Bo")
-        return served.services.find(state.id)
+        found: Scan = served.services.find(state.id)
+        return found
 
     return make

@@ -15,7 +15,8 @@ H, W = 120, 160
 def scene() -> Float[np.ndarray, "h w"]:
     """Blobs and edges, in [gray], well inside the range."""
     rng = np.random.default_rng(5)
-    return np.asarray(cv2.GaussianBlur(rng.uniform(20, 110, (H, W)), (0, 0), 1.0))
+    blurred: Float[np.ndarray, "h w"] = cv2.GaussianBlur(rng.uniform(20, 110, (H, W)), (0, 0), 1.0)
+    return blurred
 
 
 def camera(
@@ -23,7 +24,8 @@ def camera(
 ) -> np.ndarray:
     rng = np.random.default_rng(seed)
     gray = light * exposure + noise * np.sqrt(exposure) * rng.standard_normal(light.shape)
-    return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    gray8: np.ndarray = np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    return gray8
 
 
 @given(st.sampled_from([8, 10, 12, 16]), st.integers(0, 2**32 - 1))
