@@ -5,6 +5,7 @@ trigger line from that monotonic time on, in [s]; the end of its input ends it.
 """
 
 import sys
+import threading
 import time
 
 import numpy as np
@@ -16,6 +17,7 @@ from backend.devices.sim.config import SimulatedRigConfig
 from backend.devices.sim.renderer import Shown
 
 FRAMES = 8
+_NEVER = threading.Event()
 
 
 def camera(size: str) -> SimulatedCamera:
@@ -46,7 +48,7 @@ def fire(served: SimulatedCamera, start_s: float, count: int, period_s: float) -
     dark = Shown(np.zeros((1, 1), np.uint8), 0)
     for number in range(count):
         at_s = start_s + number * period_s
-        time.sleep(max(0.0, at_s - time.monotonic()))
+        _NEVER.wait(max(0.0, at_s - time.monotonic()))
         served.line_edge(dark, at_s, period_s * 1e6)
 
 

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from backend.services.kiosk import Kiosk, Monitor
 SIZE = (640, 400)
 """Of each monitor, in [px]."""
 PATIENCE_S = 120.0
+_NEVER = threading.Event()
 _TOKEN = "two-monitors-4711"
 _MODE = 'Modeline "640x400" 20.16 640 656 720 800 400 401 404 420'
 _XORG = f"""
@@ -72,7 +74,7 @@ def wait_for(ready: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S)
     deadline_s = time.monotonic() + timeout_s
     while not (found := ready()):
         assert time.monotonic() < deadline_s, f"{what} didn't happen within {timeout_s:g} s"
-        time.sleep(0.05)
+        _NEVER.wait(0.05)  # other processes tell nobody that they are ready
     return found
 
 

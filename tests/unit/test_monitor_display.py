@@ -99,7 +99,7 @@ def test_watching_looks_often_and_ends_when_told(history):
     def ended(left_s: float) -> bool:
         nonlocal looks
         looks += 1
-        time.sleep(left_s)
+        threading.Event().wait(left_s)
         return looks > 10
 
     watch(lambda: flat(looks), history, looks_per_s=200.0, ended=ended)
