@@ -15,6 +15,7 @@ from backend.devices.errors import DeviceDisconnected
 from backend.devices.peers import monitor_display
 from backend.devices.peers.monitor_display import MonitorDisplay, MonitorHistory, watch
 from backend.devices.sim import SimulatedRigConfig
+from backend.devices.sim.camera import SimulatedCamera
 from backend.devices.sim.rig import SimulatedRig
 
 SIZE = (64, 48)
@@ -35,7 +36,7 @@ def shown(display: MonitorDisplay, start_s: float, end_s: float) -> list[tuple[i
     return [(int(s.pattern[0, 0]), share) for s, share in display.during(start_s, end_s)]
 
 
-def test_an_exposure_sees_each_frame_for_its_share_of_the_time(history):
+def test_an_exposure_sees_each_frame_for_its_share_of_the_time(history: MonitorHistory) -> None:
     for time_s, level in ((0.0, 10), (1.0, 10), (2.0, 20), (3.0, 20), (4.0, 30)):
         history.note(flat(level), time_s)
     display = MonitorDisplay(history)
@@ -45,13 +46,13 @@ def test_an_exposure_sees_each_frame_for_its_share_of_the_time(history):
     assert shown(display, 3.0, 4.0) == [(20, 0.5), (30, 0.5)]
 
 
-def test_lag_delays_the_light(history):
+def test_lag_delays_the_light(history: MonitorHistory) -> None:
     for time_s, level in ((0.0, 10), (1.0, 20), (3.0, 20)):
         history.note(flat(level), time_s)
     assert shown(MonitorDisplay(history, lag_s=1.0), 1.0, 2.0) == [(10, 0.5), (20, 0.5)]
 
 
-def test_equal_frames_are_one_picture_to_whoever_caches_it(history):
+def test_equal_frames_are_one_picture_to_whoever_caches_it(history: MonitorHistory) -> None:
     for time_s in (0.0, 1.0, 2.0):
         history.note(flat(7), time_s)
     display = MonitorDisplay(history)
@@ -64,7 +65,9 @@ def test_equal_frames_are_one_picture_to_whoever_caches_it(history):
     start=st.floats(-1.0, 30.0),
     length=st.floats(0.01, 20.0),
 )
-def test_shares_add_up_and_memory_is_bounded(changes, start, length):
+def test_shares_add_up_and_memory_is_bounded(
+    changes: list[int], start: float, length: float
+) -> None:
     history = MonitorHistory(*SIZE)
     try:
         for number, level in enumerate(changes):
@@ -77,7 +80,9 @@ def test_shares_add_up_and_memory_is_bounded(changes, start, length):
         history.destroy()
 
 
-def test_it_waits_until_the_monitor_was_looked_at_after_the_exposure(history):
+def test_it_waits_until_the_monitor_was_looked_at_after_the_exposure(
+    history: MonitorHistory,
+) -> None:
     history.note(flat(10), 0.0)
     display = MonitorDisplay(history)
     timer = threading.Timer(0.05, lambda: history.note(flat(10), 5.0))
@@ -86,14 +91,16 @@ def test_it_waits_until_the_monitor_was_looked_at_after_the_exposure(history):
     timer.join()
 
 
-def test_nobody_looking_is_a_sentence(history, monkeypatch):
+def test_nobody_looking_is_a_sentence(
+    history: MonitorHistory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(monitor_display, "_PATIENCE_S", 0.05)
     history.note(flat(10), 0.0)
     with pytest.raises(DeviceDisconnected, match="nobody looks at it any more; start again"):
         MonitorDisplay(history).during(1.0, 2.0)
 
 
-def test_watching_looks_often_and_ends_when_told(history):
+def test_watching_looks_often_and_ends_when_told(history: MonitorHistory) -> None:
     began_s, looks = time.monotonic(), 0
 
     def ended(left_s: float) -> bool:
@@ -111,7 +118,7 @@ def _last_level(display: MonitorDisplay, told: Connection) -> None:
     told.send(int(display.during(1.0, 2.0)[-1][0].pattern[0, 0]))
 
 
-def test_another_process_sees_the_same(history):
+def test_another_process_sees_the_same(history: MonitorHistory) -> None:
     history.note(flat(10), 0.0)
     history.note(flat(99), 2.0)
     context = get_context("fork")
@@ -122,7 +129,7 @@ def test_another_process_sees_the_same(history):
     process.join()
 
 
-def test_a_rig_lit_by_a_monitor_mixes_what_it_showed(history):
+def test_a_rig_lit_by_a_monitor_mixes_what_it_showed(history: MonitorHistory) -> None:
     """Half the exposure white, half black: half the light."""
     options = {"scene": "plane", "size": "160x120", "projector_size": f"{SIZE[0]}x{SIZE[1]}"}
     config = SimulatedRigConfig.model_validate(
@@ -135,6 +142,7 @@ def test_a_rig_lit_by_a_monitor_mixes_what_it_showed(history):
         try:
             with rig:
                 camera = rig.cameras["left"]
+                assert isinstance(camera, SimulatedCamera)
                 camera.configure(camera.settings)
                 camera.arm()
                 now_s = time.monotonic()
