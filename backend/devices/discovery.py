@@ -7,11 +7,11 @@ itself, and GigE Vision drivers do that by broadcast: every device on every netw
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from ipaddress import AddressValueError, IPv4Address
 
 from backend.devices.driver_loading import CAMERAS, available_drivers, load_factory
 from backend.devices.errors import RigConfigError
 from backend.devices.found import FoundCamera
+from backend.devices.options import is_single_address
 from backend.devices.peers.gvcp import Bootstrap, Status, ask, read_register
 from backend.devices.rig_file import RigFile
 from backend.devices.rig_shelf import RigShelf
@@ -19,7 +19,6 @@ from backend.domain.errors import InvalidSettingError, UnglareError
 
 _DRIVER_BY_ADDRESS = "aravis"
 """Opens any vendor's GigE Vision camera by its address alone."""
-_EVERYBODY = IPv4Address("255.255.255.255")
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def known_addresses(shelf: RigShelf) -> Mapping[str, tuple[str, ...]]:
             continue  # its rig says why when it is opened or listed
         for camera, entry in file.cameras.items():
             address = str((entry.model_extra or {}).get("address") or "")
-            if _is_single(address):
+            if is_single_address(address):
                 places[address] = (*places.get(address, ()), f"{kept.name}: {camera}")
     return places
 
@@ -149,15 +148,7 @@ def _with_controller(camera: FoundCamera) -> FoundCamera:
 
 
 def _refuse_no_address(address: str) -> None:
-    if not _is_single(address):
+    if not is_single_address(address):
         raise InvalidSettingError(
             f"{address!r} is no single device's IPv4 address; write four numbers, e.g. 192.168.10.2"
         )
-
-
-def _is_single(address: str) -> bool:
-    try:
-        parsed = IPv4Address(address)
-    except AddressValueError:
-        return False
-    return not (parsed.is_multicast or parsed.is_unspecified or parsed == _EVERYBODY)

@@ -1,9 +1,10 @@
 """Options of rigs and drivers as pydantic models, refused in one sentence."""
 
 from collections.abc import Callable, Mapping
+from ipaddress import AddressValueError, IPv4Address
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from backend.devices.errors import RigConfigError
 
@@ -21,6 +22,26 @@ DisplaySize = Annotated[tuple[_Pixels, _Pixels], BeforeValidator(_size_from_text
 """The same of a real display."""
 SerialNumber = Annotated[str, Field(coerce_numbers_to_str=True)]
 """YAML reads one that consists of digits as a number."""
+_EVERYBODY = IPv4Address("255.255.255.255")
+
+
+def is_single_address(address: str) -> bool:
+    """Tell whether a text is the IPv4 address of one device: neither a name nor everybody's."""
+    try:
+        parsed = IPv4Address(address)
+    except AddressValueError:
+        return False
+    return not (parsed.is_multicast or parsed.is_unspecified or parsed == _EVERYBODY)
+
+
+def _of_one_device(address: str) -> str:
+    if address and not is_single_address(address):
+        raise ValueError("write the four numbers of its IPv4 address, e.g. 192.168.10.2")
+    return address
+
+
+SingleAddress = Annotated[str, AfterValidator(_of_one_device)]
+"""IPv4 address of one device, or empty. Libraries look for whatever else stands there by broadcast."""
 
 
 class DeviceOptions(BaseModel):

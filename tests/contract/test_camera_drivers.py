@@ -166,6 +166,14 @@ def test_options_that_contradict_each_other_are_refused(options, sentence):
         make_camera("left", "pylon", options)
 
 
+@pytest.mark.parametrize("driver", ["aravis", "pylon"])
+@pytest.mark.parametrize("address", ["255.255.255.255", "239.0.0.1", "camera-1", "192.168.10", "192.168.10.2 "])  # fmt: skip
+def test_what_is_no_single_address_never_gets_as_far_as_a_library(driver, address):
+    """Aravis asks everybody for a name that it doesn't know, pylon sends to whatever the address means."""
+    with pytest.raises(RigConfigError, match=f"left: option address can't be '{address}': write .*192.168"):  # fmt: skip
+        make_camera("left", driver, {"address": address})
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

@@ -29,7 +29,7 @@ from backend.devices.errors import (
 )
 from backend.devices.found import FoundCamera
 from backend.devices.frame_counting import FrameCounter
-from backend.devices.options import SerialNumber, read_options, takes
+from backend.devices.options import SerialNumber, SingleAddress, read_options, takes
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -52,7 +52,7 @@ _CONTROLLED = "another"
 class PylonOptions(SfncOptions):
     """How a camera is found; one of address and serial."""
 
-    address: str = ""
+    address: SingleAddress = ""
     """IPv4 address of a GigE Vision camera."""
     serial: SerialNumber = ""
     """Serial number of a USB3 Vision or emulated camera."""
