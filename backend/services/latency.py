@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -25,7 +26,7 @@ from backend.devices.rig_shelf import ASSUMED_REFRESH_HZ, LATENCY_SUFFIX
 from backend.domain.errors import StageFailedError
 from backend.domain.shots import Progress
 from backend.jobs.rigs import Owner
-from backend.numerics.settling import Settling, changing_pixels, share_of_change
+from backend.numerics.settling import COMPLETE, Settling, changing_pixels, share_of_change
 from backend.services.context import Context
 
 Gray = Float[np.ndarray, "h w"]
@@ -36,6 +37,9 @@ _AGREEING = 3
 _FULL_SCALE_GRAY = 255.0
 _STEADY_S = 0.6
 """After that any display shows what it was asked to."""
+_LEAST_STEADY_S = 0.1
+_STEADY_CHANGES = 3.0
+"""Where it is known how long a change takes, the next one may begin after so many times that."""
 
 
 @runtime_checkable
@@ -288,29 +292,37 @@ class _Bench:
         repetitions: int,
         progress: Progress,
     ) -> Settling:
-        """Try longer delays until several in a row show the whole change every time."""
-        delays_ms: list[float] = []
-        shares: list[list[list[float]]] = []
+        """Try longer and longer delays once each until the change is over, then those again many times.
+
+        A delay that was too short once is too short: only those that looked long enough are worth repeating.
+        """
+        step_ms = self._period_ms / 2
+        found: dict[int, list[list[float]]] = defaultdict(list)
         what = "black to white" if target else "white to black"
-        while len(delays_ms) < _AGREEING or min(map(_worst, shares[-_AGREEING:])) < 0.985:
-            delay_ms = len(delays_ms) * self._period_ms / 2
-            if delay_ms > _LONGEST_MS:
-                raise StageFailedError(
-                    f"The projector doesn't settle within {_LONGEST_MS:g} ms from {what}: check that the cameras see its"
-                    " screen and that nothing else changes the light."
-                )
-            done = min(delay_ms / 150.0, 0.95) / 2 + (0.0 if target else 0.5)
-            progress(done, f"{what}, {delay_ms:.0f} ms after the acknowledgement")
-            shares.append([self._shares(target, steady, delay_ms) for _ in range(repetitions)])
-            delays_ms.append(delay_ms)
-        return Settling(np.array(delays_ms), np.array(shares).transpose(1, 2, 0))
+
+        def complete(times: int, steady_s: float, step: int) -> bool:
+            delay_ms = step * step_ms
+            _refuse_endless(delay_ms, what)
+            done = min(delay_ms / 150.0, 0.9) / 2 + (0.05 if times > 1 else 0.0)
+            progress(
+                done + (0.0 if target else 0.5),
+                f"{what}, {delay_ms:.0f} ms after the acknowledgement",
+            )
+            for _ in range(times):
+                found[step].append(self._shares(target, steady, delay_ms, steady_s))
+            return min(map(min, found[step])) >= COMPLETE
+
+        first = _first_agreeing(partial(complete, 1, _STEADY_S), 0)
+        steady_s = min(_STEADY_S, _LEAST_STEADY_S + _STEADY_CHANGES * first * step_ms / 1000.0)
+        _first_agreeing(partial(complete, repetitions, steady_s), first)
+        return _settling_of(found, step_ms)
 
     def _shares(
-        self, target: int, steady: Mapping[int, list[Gray]], delay_ms: float
+        self, target: int, steady: Mapping[int, list[Gray]], delay_ms: float, steady_s: float
     ) -> list[float]:
         start = 255 - target
         self._blank(start)
-        self._clock.sleep(_STEADY_S)
+        self._clock.sleep(steady_s)
         pictures = self._pictures(target, delay_ms / 1000.0)
         return [
             share_of_change(gray, before, after, _lit(dark, bright))
@@ -343,8 +355,29 @@ def _lit(dark: Gray, bright: Gray) -> Bool[np.ndarray, "h w"]:
     return changing_pixels(dark, bright, full_scale_gray=_FULL_SCALE_GRAY)
 
 
-def _worst(repetitions: list[list[float]]) -> float:
-    return min(min(cameras) for cameras in repetitions)
+def _first_agreeing(complete: Callable[[int], bool], start: int) -> int:
+    """Try step after step until several in a row are complete, and return the first of these."""
+    step, agreeing = start, 0
+    while agreeing < _AGREEING:
+        agreeing = agreeing + 1 if complete(step) else 0
+        step += 1
+    return step - _AGREEING
+
+
+def _refuse_endless(delay_ms: float, what: str) -> None:
+    if delay_ms > _LONGEST_MS:
+        raise StageFailedError(
+            f"The projector doesn't settle within {_LONGEST_MS:g} ms from {what}: check that the cameras see its"
+            " screen and that nothing else changes the light."
+        )
+
+
+def _settling_of(found: Mapping[int, list[list[float]]], step_ms: float) -> Settling:
+    """Write what was found, steps that were tried less often filled up with what they gave."""
+    most = max(map(len, found.values()))
+    cameras = len(found[0][0])
+    shares = [np.resize(np.array(found[step]), (most, cameras)) for step in range(len(found))]
+    return Settling(np.arange(len(found)) * step_ms, np.stack(shares, axis=-1))
 
 
 def _smallest(settling: Settling, count: int) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -131,14 +131,14 @@ class Desktop:
         command: Sequence[str],
         *,
         pass_fds: tuple[int, ...] = (),
-        **environment: str,
+        more: Mapping[str, str] | None = None,
     ) -> Program:
         """Start a program that dies with this process."""
         log = self.folder / f"{name}.log"
         with log.open("wb") as file:
             process = subprocess.Popen(
                 ["setpriv", "--pdeathsig", "KILL", *command],
-                env=self.environment | environment,
+                env=self.environment | dict(more or {}),
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -150,7 +150,7 @@ class Desktop:
 
     def unglare(self, name: str, *arguments: str, **environment: str) -> Program:
         """Start a command of ours."""
-        return self.start(name, [sys.executable, "-m", "backend.cli", *arguments], **environment)
+        return self.start(name, [sys.executable, "-m", "backend.cli", *arguments], more=environment)
 
     def xrandr(self, *arguments: str) -> None:
         """Arrange the monitors."""

@@ -130,6 +130,32 @@ def test_the_lag_is_found_and_a_period_more_is_waited(lag_ms: float) -> None:
     assert found.down[-1] > 0.98
 
 
+class UnsteadyScreen(LaggingScreen):
+    """Is slower now and then."""
+
+    def blank(self, level: int = 0) -> Presented:
+        self.lag_s = 0.030 if len(self.changes) % 9 == 0 else 0.020
+        return super().blank(level)
+
+
+def test_the_slowest_of_many_changes_counts() -> None:
+    clock = VirtualTime()
+    screen = UnsteadyScreen(0.0, clock)
+    found = latency.latency_of(
+        screen, [Camera("left", screen)], _silent, repetitions=10, clock=clock
+    )
+    assert found.settle_ms >= 30.0 + 1000 * PERIOD_S
+
+
+def test_only_delays_that_may_be_long_enough_are_repeated() -> None:
+    clock = VirtualTime()
+    screen = LaggingScreen(0.060, clock, refresh_hz=60.0)
+    latency.latency_of(screen, [Camera("left", screen)], _silent, repetitions=10, clock=clock)
+    too_short = 8  # half periods of 60 Hz in 60 ms
+    assert 2 * 3 * 10 < len(screen.changes) / 2 <= 2 * (too_short + 3 + 3 * 10) + 3
+    assert clock.now_s() - 100.0 < 60.0
+
+
 def test_cameras_that_see_nothing_are_named() -> None:
     with pytest.raises(StageFailedError, match="Camera left doesn't see the projector's light"):
         measured(0.0, gray=1.0)
