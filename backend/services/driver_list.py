@@ -75,8 +75,10 @@ def _listed(group: str, name: str, package: str) -> ListedDriver:
 
 
 def _options(schema: dict[str, Any]) -> Iterator[DriverOption]:
+    """List the options, those that are required first."""
     required = schema.get("required", ())
-    for name, described in schema.get("properties", {}).items():
+    properties = schema.get("properties", {})
+    for name, described in sorted(properties.items(), key=lambda item: item[0] not in required):
         yield DriverOption(
             name=name,
             values=_values(described, schema.get("$defs", {})),

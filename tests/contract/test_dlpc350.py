@@ -184,6 +184,14 @@ def test_a_sequence_is_started_once_only(projector):
         projector.start_sequence()
 
 
+def test_a_pattern_that_was_shown_meanwhile_is_not_started_as_the_sequence(projector, bench):
+    projector.load([even(255), even(100)])
+    projector.arm_sequence([0], 8333.0, 8333.0)
+    projector.show(1)
+    with pytest.raises(FeatureError, match="arm_sequence first"):
+        projector.start_sequence()
+
+
 @pytest.mark.parametrize(
     ("exposure_us", "period_us", "sentence"),
     [
@@ -269,6 +277,25 @@ def test_a_measured_settle_time_confirms_the_light(device, folder):
     with projector_of(device, folder, settle_ms=20.0) as projector:
         projector.load([even(100)])
         assert projector.show(0).confirmed
+
+
+@pytest.mark.parametrize("settle_ms", [None, 20.0])
+def test_an_image_that_loads_slowly_is_waited_for_whatever_was_measured_with_even_fields(
+    tmp_path, bench, monkeypatch, settle_ms
+):
+    noise = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+    write_set(tmp_path, [NewPattern(noise, "noise")], pack=True)
+    (image,) = PatternSet.read(tmp_path).image_pictures(tmp_path)
+    waits_s: list[float] = []
+    with (
+        SimulatedDlpc350(bench, [image]) as device,
+        projector_of(device, tmp_path, settle_ms=settle_ms) as projector,
+    ):
+        projector.load([noise])
+        monkeypatch.setattr(projector._stop, "wait", waits_s.append)
+        projector.show(0)
+    more_ms = 8.333 if settle_ms is None else settle_ms
+    assert 1e3 * waits_s[-1] == pytest.approx(load_ms(image) + more_ms, abs=0.01)
 
 
 def test_even_fields_come_from_the_set(projector, bench):
@@ -724,3 +751,41 @@ def test_stopping_from_another_thread_ends_a_sequence(projector, device):
     stopping.start()
     stopping.join(timeout=5)
     assert device._action is Action.STOP
+
+
+class SlowHid:
+    """A connection whose device takes its time to answer."""
+
+    def __init__(self) -> None:
+        self.asked, self.answers, self.closed = (threading.Event() for _ in range(3))
+        self.closed_while_asked = False
+
+    def write(self, data: bytes) -> int:
+        return len(data)
+
+    def read(self, max_length: int, timeout_ms: int = 0) -> bytes:
+        del max_length, timeout_ms
+        self.asked.set()
+        self.answers.wait(5)
+        self.closed_while_asked = self.closed.is_set()
+        return protocol.Reply(1).reports().__next__()
+
+    def close(self) -> None:
+        self.closed.set()
+
+
+def test_a_connection_is_not_closed_under_a_command():
+    """hidapi frees what a read in another thread still uses."""
+    hid = SlowHid()
+    commands = Commands("projector", hid)
+    asking = threading.Thread(target=commands.write, args=(Command.POWER, b"\0"))
+    closing = threading.Thread(target=commands.close)
+    asking.start()
+    assert hid.asked.wait(5)
+    closing.start()
+    assert not hid.closed.wait(0.05)
+    hid.answers.set()
+    asking.join(5)
+    closing.join(5)
+    assert hid.closed.is_set()
+    assert not hid.closed_while_asked

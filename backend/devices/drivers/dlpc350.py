@@ -83,7 +83,8 @@ class Dlpc350Options(DeviceOptions):
     show_period_us: int = Field(8333, ge=235, le=2_000_000)
     """Period of a single pattern that is shown until the next: exposures should be multiples of it."""
     settle_ms: float | None = Field(None, ge=0, le=10_000)
-    """From the start of a single pattern to its light, as the latency calibration found it; None: not measured yet."""
+    """From the start of a single pattern, its image being loaded, to its light, as the latency calibration found it;
+    None: not measured yet."""
     standby: bool = False
     """Leave the projector in standby when it is closed."""
 
@@ -295,7 +296,7 @@ class Dlpc350Projector(Link):
         refuse_level(self.name, level)
         if level == 0:
             self._halt()
-            return self._settled(-1, 0.0)
+            return self._settled(-1, loading_ms=0.0, frame_ms=0.0)
         width, height = protocol.SIZE_PX
         even = self._by_hash.get(pattern_hash(np.full((height, width), level, np.uint8)))
         if even is None:
@@ -317,17 +318,17 @@ class Dlpc350Projector(Link):
     def _show(self, pattern: SetPattern, index: int) -> Presented:
         run = self._run((pattern,))
         period_us = self._options.show_period_us
-        likely_ms = (
-            self._loading_ms(run.images[0]) + period_us / 1000.0
-        )  # measured while nothing runs
+        loading_ms = self._loading_ms(run.images[0])  # measured while nothing runs
         self._program(run, period_us, period_us, repeat=True)
         self._start(None)
-        return self._settled(index, likely_ms)
+        return self._settled(index, loading_ms=loading_ms, frame_ms=period_us / 1000.0)
 
-    def _settled(self, index: int, likely_ms: float) -> Presented:
-        """Wait until the pattern is lit: as long as measured, else as long as its image takes to load, and a period."""
-        wait_ms = likely_ms if self.settle_ms is None else self.settle_ms
-        self._stop.wait(wait_ms / 1000.0)
+    def _settled(self, index: int, *, loading_ms: float, frame_ms: float) -> Presented:
+        """Wait until the pattern is lit: its image is loaded, and then as long as measured, else a frame.
+
+        The latency is measured with even fields, which load at once; other images take up to 200 ms.
+        """
+        self._stop.wait((loading_ms + (frame_ms if self.settle_ms is None else self.settle_ms)) / 1000.0)
         return Presented(index, time.monotonic(), None, confirmed=self.settle_ms is not None)
 
     # ------------------------------------------------------------ sequences
@@ -346,7 +347,6 @@ class Dlpc350Projector(Link):
         self._refuse_timing(exposure, period)
         run = self._run([self._loaded[index] for index in indices])
         self._refuse_slow_loading(run, period)
-        self._duration_s = None
         self._program(run, exposure, period, repeat=False)
         self._duration_s = len(indices) * period * 1e-6
 
@@ -441,6 +441,7 @@ class Dlpc350Projector(Link):
     # ------------------------------------------------------------ the device's tables
 
     def _program(self, run: _Run, exposure_us: int, period_us: int, *, repeat: bool) -> None:
+        self._duration_s = None  # whatever was prepared is overwritten
         self._halt()
         for command, payload in _tables(run, exposure_us, period_us, repeat=repeat):
             self._written(command, payload)

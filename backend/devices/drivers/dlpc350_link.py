@@ -26,6 +26,7 @@ INSTALL = "pip install 'unglare[lightcrafter]'"
 
 _ANSWER_S = 2.0
 _CONNECT_S = 2.0
+_CLOSE_S = 2 * _ANSWER_S
 
 
 @runtime_checkable
@@ -185,9 +186,14 @@ class Commands:
         self._sequence = 0
 
     def close(self) -> None:
-        """Give the connection back."""
-        with contextlib.suppress(OSError, ValueError):
-            self._hid.close()
+        """Give the connection back, after the command that another thread may be waiting for."""
+        if not self._lock.acquire(timeout=_CLOSE_S):
+            return  # hidapi frees what a call in progress still uses: rather leave it open than crash
+        try:
+            with contextlib.suppress(OSError, ValueError):
+                self._hid.close()
+        finally:
+            self._lock.release()
 
     def write(self, command: Command, payload: bytes) -> None:
         """Send a command and wait until the device has acknowledged it.
