@@ -20,7 +20,7 @@ from backend.devices.driver_loading import make_projector
 from backend.devices.drivers.aravis_camera import AravisCamera, AravisOptions
 from backend.devices.drivers.aravis_library import AravisMissingError, aravis
 from backend.devices.drivers.dlpc350 import Dlpc350Options, Dlpc350Projector
-from backend.devices.drivers.dlpc350_link import SocketHid
+from backend.devices.drivers.dlpc350_link import Commands, SocketHid
 from backend.devices.errors import (
     DeviceBusy,
     DeviceDisconnected,
@@ -768,7 +768,7 @@ class SlowHid:
         self.asked.set()
         self.answers.wait(5)
         self.closed_while_asked = self.closed.is_set()
-        return protocol.Reply(1).reports().__next__()
+        return next(protocol.Reply(1).reports())
 
     def close(self) -> None:
         self.closed.set()
@@ -779,13 +779,13 @@ def test_a_connection_is_not_closed_under_a_command():
     hid = SlowHid()
     commands = Commands("projector", hid)
     asking = threading.Thread(target=commands.write, args=(Command.POWER, b"\0"))
-    closing = threading.Thread(target=commands.close)
+    hanging_up = threading.Thread(target=commands.close)
     asking.start()
     assert hid.asked.wait(5)
-    closing.start()
+    hanging_up.start()
     assert not hid.closed.wait(0.05)
     hid.answers.set()
     asking.join(5)
-    closing.join(5)
+    hanging_up.join(5)
     assert hid.closed.is_set()
     assert not hid.closed_while_asked

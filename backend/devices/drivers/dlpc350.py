@@ -328,7 +328,9 @@ class Dlpc350Projector(Link):
 
         The latency is measured with even fields, which load at once; other images take up to 200 ms.
         """
-        self._stop.wait((loading_ms + (frame_ms if self.settle_ms is None else self.settle_ms)) / 1000.0)
+        self._stop.wait(
+            (loading_ms + (frame_ms if self.settle_ms is None else self.settle_ms)) / 1000.0
+        )
         return Presented(index, time.monotonic(), None, confirmed=self.settle_ms is not None)
 
     # ------------------------------------------------------------ sequences
