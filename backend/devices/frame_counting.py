@@ -2,6 +2,8 @@
 
 _WRAP = 0xFFFF
 """GigE Vision counts frames from 1 to 65535, and then from 1 again."""
+_INVALID = 0xFFFF_FFFF_FFFF_FFFF
+"""What libraries call the block of a frame that failed before its number came."""
 
 
 class FrameCounter:
@@ -31,6 +33,10 @@ class FrameCounter:
 
     def count(self, block: int) -> int:
         """Return the running number of a frame; the block of a camera that doesn't count never changes."""
+        if block == _INVALID:
+            self._number += 1
+            self._last = None if self._last is None else self._last + 1
+            return self._number
         step = 1 if self._last is None else block - self._last
         self._number += max(step % _WRAP if step < 0 else step, 1)
         self._last = block
