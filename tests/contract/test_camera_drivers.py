@@ -591,11 +591,16 @@ class FakeFeatures:
 
     def set_text(self, name: str, value: str) -> None:
         assert value in self.offers[name]
+        locked = name == "TriggerSource" and self.texts["TriggerMode"] == "On"
+        assert not locked, "some cameras lock it then"
         self.texts[name] = value
         self.log.append((name, value))
 
     def set_number(self, name: str, value: float) -> None:
-        assert self.limits[name][0] <= value <= self.limits[name][1]
+        low, high, step = self.limits[name]
+        assert low <= value <= high
+        if step and abs((value - low) / step - round((value - low) / step)) > 1e-6:
+            raise ValueError(f"{name} {value} is between two steps")
         self.numbers[name] = value
         self.log.append((name, value))
 
@@ -669,6 +674,27 @@ def test_a_raw_gain_is_set_in_its_own_steps():
     taken = made.apply(replace(made.read(), gain_db=6.01), made.read())
     assert features.numbers["GainRaw"] == 320
     assert taken.gain_db == pytest.approx(6.0)
+
+
+def test_exposures_between_two_steps_are_rounded():
+    made, features = controls({"ExposureTime": (70.0, 10, 1e6, 20, "us")}, TRIGGER)
+    taken = made.apply(replace(made.read(), exposure_us=16_683.0), made.read())
+    assert taken.exposure_us == features.numbers["ExposureTime"] == 16_690.0
+
+
+def test_what_a_camera_refuses_leaves_the_old_settings(monkeypatch):
+    made, features = controls({**OLD_NAMES, "GainAbs": (0.0, 0, 20, 0, "")}, TRIGGER)
+    before, set_number = made.read(), features.set_number
+
+    def without_gain(name: str, value: float) -> None:
+        if name == "GainAbs":
+            raise ValueError("no")
+        set_number(name, value)
+
+    monkeypatch.setattr(features, "set_number", without_gain)
+    with pytest.raises(ValueError, match="no"):
+        made.apply(replace(before, exposure_us=9000.0, gain_db=6.0), before)
+    assert made.read() == before
 
 
 def test_triggers_that_would_hold_frames_back_are_switched_off():

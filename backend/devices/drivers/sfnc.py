@@ -3,6 +3,7 @@
 Which library reads the camera's description doesn't matter here: each brings its `Features`.
 """
 
+from contextlib import suppress
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -263,31 +264,42 @@ class SfncControls:
         return TriggerSource(features.text("TriggerSource"))
 
     def apply(self, wanted: CameraSettings, now: CameraSettings) -> CameraSettings:
-        """Set what differs and return what holds then."""
+        """Set what differs and return what holds then; what is refused leaves everything as it was."""
+        try:
+            self._change(wanted, now)
+        except BaseException:
+            with suppress(Exception):  # the first error says what is wrong
+                self._change(now, wanted)
+            raise
+        return self.read()
+
+    def _change(self, wanted: CameraSettings, now: CameraSettings) -> None:
         if wanted.pixel_format not in (None, now.pixel_format):
             self._features.set_text("PixelFormat", str(wanted.pixel_format))
         if wanted.trigger is not now.trigger:
             self._set_trigger(wanted.trigger)
         if wanted.exposure_us != now.exposure_us:
-            self._features.set_number(self._exposure, wanted.exposure_us)
+            self._set_nearest(self._exposure, wanted.exposure_us)
         if wanted.gain_db != now.gain_db:
             self._set_gain(wanted.gain_db)
-        return self.read()
 
     def _set_gain(self, gain_db: float) -> None:
         if not self._raw_gain:
-            self._features.set_number(self._gain, gain_db)
+            self._set_nearest(self._gain, gain_db)
             return
-        low, high, step = self._features.bounds(self._raw_gain)
-        raw = Range(low, high, step).nearest(low + gain_db / self._db_per_step())
-        self._features.set_number(self._raw_gain, raw)
+        low, _, _ = self._features.bounds(self._raw_gain)
+        self._set_nearest(self._raw_gain, low + gain_db / self._db_per_step())
+
+    def _set_nearest(self, name: str, value: float) -> None:
+        """Set a number to the value next to the wanted one that the camera has: it may refuse those between."""
+        self._features.set_number(name, Range(*self._features.bounds(name)).nearest(value))
 
     def _set_trigger(self, trigger: TriggerSource) -> None:
+        self._set_if_possible("TriggerMode", "Off")  # while it is on, some lock the source
         if trigger is TriggerSource.FREE_RUN:
-            self._set_if_possible("TriggerMode", "Off")
             return
-        self._features.set_text("TriggerMode", "On")
         self._features.set_text("TriggerSource", trigger.value)
+        self._features.set_text("TriggerMode", "On")
 
 
 def bits_of(pixel_format: str) -> int:
