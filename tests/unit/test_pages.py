@@ -105,6 +105,24 @@ def test_a_projector_that_cant_open_its_page_leaves_it_to_others(desk: PageDesk)
     right.open()
 
 
+def test_a_page_that_goes_while_it_is_taken_leaves_the_projector_closed(
+    desk: PageDesk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    browser = Browser(desk)
+    projector = PageProjector("projector", PageOptions(size=(64, 48)), desk)
+
+    def closed_meanwhile(timeout_s: float) -> None:
+        browser.page.left()
+
+    monkeypatch.setattr(browser.page, "wait_for_refresh", closed_meanwhile)
+    with pytest.raises(DeviceDisconnected, match="was closed or reloaded"):
+        projector.open()
+    assert projector.state is LinkState.CLOSED
+    Browser(desk)
+    projector.open()
+    projector.blank(0)
+
+
 def test_a_lost_page_is_opened_again_and_gets_its_patterns(desk: PageDesk) -> None:
     browser = Browser(desk)
     projector = opened(desk)

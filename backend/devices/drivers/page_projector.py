@@ -126,7 +126,7 @@ class PageProjector(Link):
         try:
             self._take_page()
         except DeviceError:
-            self._desk.let_go(self._options.page, self)
+            self.close()  # the page may have gone after it was taken
             raise
 
     def _take_page(self) -> None:
