@@ -250,6 +250,19 @@ def test_the_producers_that_are_registered_are_asked(monkeypatch):
 
 
 @pytest.mark.usefixtures("nothing_to_find")
+def test_a_producer_that_cant_be_loaded_does_not_stop_the_others(monkeypatch, tmp_path):
+    genicam = pytest.importorskip("genicam")
+    pytest.importorskip("harvesters")
+    (tmp_path / "half_removed.cti").write_text("nothing that could be loaded")
+    monkeypatch.setenv(gentl_camera.PRODUCERS_PATH, f"{tmp_path}:{Path(genicam.__file__).parent}")
+    result = discovery.search(["gentl"])
+    assert (len(result.cameras), result.problems) == (3, ())
+    monkeypatch.setenv(gentl_camera.PRODUCERS_PATH, str(tmp_path))
+    (problem,) = discovery.search(["gentl"]).problems
+    assert "half_removed.cti can't be loaded" in problem
+
+
+@pytest.mark.usefixtures("nothing_to_find")
 def test_drivers_that_fail_do_not_stop_the_others(monkeypatch):
     def missing() -> tuple[Listed, ...]:
         raise AravisMissingError("libaravis isn't installed; run: apt-get install it")

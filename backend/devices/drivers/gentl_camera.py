@@ -42,11 +42,14 @@ from backend.devices.protocols import (
     TriggerSource,
 )
 
+log = logging.getLogger(__name__)
+
 PRODUCERS_PATH = "GENICAM_GENTL64_PATH"
 """Environment variable in which vendors' installers list the folders of their producers."""
 _FEWEST_BUFFERS = 6
 _FREE_RUN_BUFFERS = 3
 _LOOK_MS = 1000
+_READY_POLL_S = 0.001
 _TRIGGER_WAIT = "FrameTriggerWait"
 _READABLE = 3
 """Access modes of GenApi: not implemented, not available, write only, read only, read and write."""
@@ -168,14 +171,16 @@ class GentlCamera(LibraryCamera):
         self._acquirer.stop()
 
     def _ready(self, wait_s: float) -> bool:
-        """Ask the camera, if it has a status for that."""
-        del wait_s
+        """Ask the camera, if it has a status for that; in between it is left in peace."""
         features = self._features
         assert features is not None, "made by _connect"
         if _TRIGGER_WAIT not in features.choices("AcquisitionStatusSelector"):
             return True
         features.set_text("AcquisitionStatusSelector", _TRIGGER_WAIT)
-        return features.number("AcquisitionStatus") != 0
+        ready = features.number("AcquisitionStatus") != 0
+        if not ready:
+            self._aborted.wait(min(_READY_POLL_S, wait_s))
+        return ready
 
     def _fire(self) -> None:
         assert self._features is not None, "made by _connect"
@@ -363,8 +368,25 @@ def _first_part(error: Exception) -> str:
 
 
 def search() -> tuple[FoundCamera, ...]:
-    """Let the producers that vendors' installers registered look for cameras; those for GigE Vision broadcast."""
-    return tuple(found for path in _registered() for found in _seen_by(path))
+    """Let the producers that vendors' installers registered look for cameras; those for GigE Vision broadcast.
+
+    Raises
+    ------
+    DeviceNotFound
+        If none sees a camera and one can't be used, e.g. that of a program that was half removed.
+    """
+    found: list[FoundCamera] = []
+    failed: list[DeviceError] = []
+    for path in _registered():
+        try:
+            found += _seen_by(path)
+        except DeviceError as error:
+            failed.append(error)
+    if failed and not found:
+        raise failed[0]
+    for error in failed:
+        log.warning("%s", error)
+    return tuple(found)
 
 
 def _registered() -> list[Path]:
@@ -375,7 +397,13 @@ def _registered() -> list[Path]:
 def _seen_by(path: Path) -> list[FoundCamera]:
     producer = _borrow("gentl", path)
     try:
-        producer.look()
+        try:
+            producer.look()
+        except _library_errors() as error:
+            raise DeviceNotFound(
+                "gentl",
+                f"GenTL producer {path} can't look for cameras ({_first_part(error)}); install the vendor's software again",
+            ) from error
         return [
             FoundCamera(
                 "gentl",
