@@ -163,6 +163,17 @@ def test_a_camera_that_goes_away_and_comes_back(addresses):
         camera.get_frame()
 
 
+def test_whoever_aborts_waiting_is_told_that_and_not_that_time_is_up(addresses):
+    with network(addresses) as (_, peers), opened(addresses) as camera:
+        peers[0].stop()
+        threading.Timer(0.2, camera.abort).start()
+        with pytest.raises(
+            DeviceDisconnected, match=r"is no longer waited for .*no camera answers"
+        ):
+            camera.reconnect(timeout_s=60.0)
+        assert camera.state is LinkState.LOST
+
+
 def test_control_ends_with_the_heartbeat_of_a_client_that_died(addresses):
     with network(addresses) as (_, peers), opened(addresses) as camera:
         peers[0]._client = ("127.0.0.1", 9)  # somebody who never says anything again

@@ -39,6 +39,7 @@ SLICE_S = 0.1
 """How long a wait lasts before `abort` and a lost device are noticed."""
 HEARTBEAT_S = 3.0
 """So long a dead client keeps control of a camera on the network."""
+_RETRY_S = 0.25
 _READY_S = 2.0
 _PATIENCE_S = 2.0
 """How long `abort` and `close` wait for a call of the library to return."""
@@ -148,7 +149,9 @@ class LibraryCamera(Link):
                 self.open()
                 break
             except (DeviceBusy, DeviceNotFound, DeviceTimeout, DeviceDisconnected) as error:
-                if time.monotonic() > deadline_s or self._given_up.wait(0.25):
+                if self._given_up.wait(_RETRY_S):
+                    raise self._lose(f"is no longer waited for ({error})") from error
+                if time.monotonic() > deadline_s:
                     raise self._lose(
                         f"doesn't come back within {patience_s:g} s ({error})"
                     ) from error
