@@ -384,8 +384,8 @@ def search() -> tuple[FoundCamera, ...]:
             failed.append(error)
     if failed and not found:
         raise failed[0]
-    for error in failed:
-        log.warning("%s", error)
+    for problem in failed:
+        log.warning("%s", problem)
     return tuple(found)
 
 
