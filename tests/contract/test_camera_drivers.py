@@ -479,6 +479,17 @@ def test_what_a_device_does_not_take_is_refused(options, sentence):
     assert device.released
 
 
+def test_an_exposure_that_is_taken_otherwise_leaves_the_old_one():
+    device = FakeDevice()
+    with webcam(device) as camera:
+        before = camera.settings
+        device.exposures = (3, 500)  # less than it said
+        with pytest.raises(FeatureError, match=r"left: EXPOSURE 1000 isn't taken, .* says 500"):
+            camera.configure(replace(before, exposure_us=100_000.0))
+        assert camera.settings == before
+        assert device.values[cv2.CAP_PROP_EXPOSURE] == before.exposure_us / 100
+
+
 def test_frames_that_waited_before_arming_or_another_exposure_are_thrown_away():
     device = FakeDevice()
     with webcam(device) as camera:

@@ -96,6 +96,16 @@ def test_nobody_at_the_address_is_one_sentence(addresses):
     assert camera.state is LinkState.CLOSED
 
 
+def test_a_frame_of_another_size_is_no_frame(addresses):
+    with network(addresses), opened(addresses) as camera:
+        width_px, height_px = camera.capabilities.sensor_size
+        camera._capabilities = replace(camera.capabilities, sensor_size=(width_px, height_px - 1))
+        camera.arm()
+        camera.trigger()
+        with pytest.raises(IncompleteFrame, match=f"is {width_px}x{height_px}, not {width_px}x{height_px - 1}"):  # fmt: skip
+            camera.get_frame()
+
+
 def test_a_second_controller_is_refused(addresses):
     with network(addresses), opened(addresses) as camera:
         other = AravisCamera("other", AravisOptions(address=addresses[0]))

@@ -258,11 +258,13 @@ class AravisCamera(LibraryCamera):
         bits = bits_of(pixel_format)
         content = _content(buffer)
         samples = content if bits == 8 else content[: content.size // 2 * 2].view("<u2")
-        data = gray_of(samples, width_px, height_px, pixel_format)
-        if data is None:
+        wanted_px = self.capabilities.sensor_size
+        data = gray_of(samples, *wanted_px, pixel_format)
+        if data is None or (width_px, height_px) != wanted_px:
             raise IncompleteFrame(
-                self.name, f"frame {number} is too short for {width_px}x{height_px} {pixel_format}; take it again"
-            )  # fmt: skip
+                self.name,
+                f"frame {number} is {width_px}x{height_px}, not {wanted_px[0]}x{wanted_px[1]} {pixel_format}; take it again",
+            )
         at_s = int(library.plain("arv_buffer_get_timestamp", buffer)) * 1e-9
         return self._told(data, number, at_s, bits)
 

@@ -219,7 +219,12 @@ class VideoCamera(LibraryCamera):
 
     def _apply(self, wanted: CameraSettings) -> CameraSettings:
         if wanted.exposure_us != self._settings.exposure_us:
-            self._set("EXPOSURE", round(wanted.exposure_us / _EXPOSURE_STEP_US))
+            before = self._get("EXPOSURE")
+            try:
+                self._set("EXPOSURE", round(wanted.exposure_us / _EXPOSURE_STEP_US))
+            except FeatureError:
+                self._nearest_exposure(before)  # it may have taken another one
+                raise
             self._to_drop = self.capabilities.buffered_frames + 1
         return self._read_settings(self.capabilities.exposure_us)
 
