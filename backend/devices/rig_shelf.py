@@ -154,7 +154,7 @@ class RigShelf:
         )
         path = self.calibration_path(name)
         path.write_text(
-            f"# from {source}; x_device = R x_world + t_mm in mm, as OpenCV has it\n{text}"
+            f"# from {source}; x_device = R x_world + t_mm in mm, as OpenCV has it\n{text}", "utf-8"
         )
         return path
 
