@@ -227,7 +227,7 @@ class RigDesk:
 
         def attempt(control: JobControl) -> Found:
             control.progress(0.1, "white and black frames")
-            trial = try_rig(self._context, rig, options, who=who)
+            trial = try_rig(self._context, rig, options, who=who, control=control)
             lines = tuple(
                 f"{f.camera}: white {f.mean_gray:.0f}, black {f.dark_mean_gray:.1f} gray at {f.exposure_ms:.1f} ms, "
                 f"{f.saturated_share:.1%} saturated"

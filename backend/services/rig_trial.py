@@ -65,24 +65,32 @@ class RigTrial:
 
 
 def try_rig(
-    context: Context, name: str, options: Mapping[str, Any], *, who: str = "rigs check"
+    context: Context,
+    name: str,
+    options: Mapping[str, Any],
+    *,
+    who: str = "rigs check",
+    control: JobControl | None = None,
 ) -> RigTrial:
     """Open a rig and take a white and a black frame with every camera; `who` owns it meanwhile.
 
     Raises
     ------
+    CancelledError
+        If `control` is stopped.
     UnglareError
         If the rig can't be opened, is busy, or a device fails: the sentence names it.
     """
-    with context.rigs.lease(name, options, Owner("", "check", who)) as lease:
-        return lease.call(lambda rig: _try(name, rig, lease.threads))
+    control = control or JobControl()
+    with context.rigs.lease(name, options, Owner("", "check", who), control) as lease:
+        return lease.call(lambda rig: _try(name, rig, lease.threads, control))
 
 
-def _try(name: str, rig: Rig, threads: DeviceThreads) -> RigTrial:
+def _try(name: str, rig: Rig, threads: DeviceThreads, control: JobControl) -> RigTrial:
     facts, calibration = rig.facts(), rig.calibration()
     devices = tuple(_devices(rig))
     try:
-        frames = _frames(rig, facts, threads)
+        frames = _frames(rig, facts, threads, control)
     except DeviceError as error:
         return RigTrial(
             name, _who(rig.info), devices, (), _calibration_words(calibration), (error.sentence,)
@@ -125,11 +133,13 @@ def _who(info: DeviceInfo) -> str:
     return " ".join(word for word in words if word)
 
 
-def _frames(rig: Rig, facts: RigFacts, threads: DeviceThreads) -> tuple[TestFrame, ...]:
+def _frames(
+    rig: Rig, facts: RigFacts, threads: DeviceThreads, control: JobControl
+) -> tuple[TestFrame, ...]:
     low_ms = max(c.exposure_min_ms for c in facts.cameras.values())
     high_ms = min(c.exposure_max_ms for c in facts.cameras.values())
     exposure_ms = float(np.clip(_EXPOSURE_MS, low_ms, high_ms))
-    with Shooter(rig, JobControl(), threads) as shooter:
+    with Shooter(rig, control, threads) as shooter:
         width_px, height_px = shooter.projector_size
         shooter.load([render(p, width_px=width_px, height_px=height_px) for p in (WHITE, BLACK)])
         white, black = (

@@ -348,6 +348,20 @@ def test_a_trial_tells_what_looks_wrong(bench: Bench) -> None:
     assert work["lines"][0].startswith("left: white ")
 
 
+def test_a_trial_is_cancelled_while_a_camera_keeps_it_waiting(bench: Bench) -> None:
+    bench.connect()
+    bench.house.rigs.faults.hold = threading.Event()
+    bench.operator.post(f"{RIG}/trial")
+    rig = bench.house.rigs.opened[0]
+    until(lambda: rig.cameras["left"].frames == 1)
+    assert bench.operator.delete(f"{RIG}/work").status_code == 200
+
+    assert worked(bench)["status"] == "cancelled"
+    assert rig.projector.picture.max() == 0
+    bench.house.rigs.faults.hold.set()
+    assert bench.picture()["number"] >= 0
+
+
 @pytest.fixture
 def _hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(latency, "_STEADY_S", 0.0)
