@@ -56,6 +56,11 @@ class DriverThread:
         self._thread: threading.Thread | None = None
         self._left: Exception | None = None
 
+    @property
+    def is_here(self) -> bool:
+        """Whether the caller runs on this thread."""
+        return threading.current_thread() is self._thread
+
     def submit(self, work: Callable[[], T]) -> "Future[T]":
         """Queue a call; it fails at once if the thread was left."""
         future: Future[T] = Future()

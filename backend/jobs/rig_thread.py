@@ -62,6 +62,11 @@ class RigThread:
             thread = self._thread
         return thread.submit(work)
 
+    @property
+    def is_here(self) -> bool:
+        """Whether the caller runs on the rig's thread, and not on one that was left behind."""
+        return self._thread.is_here
+
     @contextmanager
     def limited(self, rig: Rig, doing: str) -> Iterator[None]:
         """Give up the thread that runs this block, and the rig, if it takes too long.

@@ -434,7 +434,7 @@ class _Slot:
                 return
             self._link = RigLink.OPENING
             self._asked_options = dict(options)
-        opening = self._thread.submit(lambda: self._open(options, None))
+        opening = self._thread.submit(lambda: self._open_unless_lent(options))
         opening.add_done_callback(self._note_failure)
         self._publish(RigChanged(rig=self.name))
 
@@ -515,6 +515,13 @@ class _Slot:
             raise self._closed_meanwhile()
         return self._rig
 
+    def _open_unless_lent(self, options: Mapping[str, Any]) -> None:
+        """Open the rig, unless somebody has begun to capture meanwhile: it is opened with his options."""
+        if self._owner is None:
+            self._open(options, None)
+        else:
+            self._link = RigLink.CLOSED if self._rig is None else RigLink.OPEN
+
     def _open(self, options: Mapping[str, Any], made: Rig | None) -> None:
         if self._rig is not None and self.holds(options) and _is_healthy(self._rig):
             self._link = RigLink.OPEN
@@ -524,7 +531,8 @@ class _Slot:
         try:
             self._open_anew(made or self._open_rig(self.name, options), options)
         except BaseException:
-            self._link = RigLink.CLOSED
+            if self._thread.is_here:
+                self._link = RigLink.CLOSED
             raise
         self._link, self._failure = RigLink.OPEN, None
         self._publish(RigChanged(rig=self.name))
@@ -534,10 +542,12 @@ class _Slot:
             rig.open()
             try:
                 self._tell_opened(self.name, _canonical(options), rig)
-                self._devices, self._facts = _known(rig), rig.facts()
+                devices, facts = _known(rig), rig.facts()
             except BaseException:
                 rig.close()
                 raise
+        # Only now: a thread that was left behind doesn't get here, another rig may be open meanwhile.
+        self._devices, self._facts = devices, facts
         self._threads = DeviceThreads(known.device for known in self._devices)
         self._rig, self._options = rig, _canonical(options)
 

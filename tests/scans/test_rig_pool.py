@@ -2,16 +2,17 @@
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 
 from backend.contract.events import Event, RigChanged
 from backend.contract.rigs import RigLink
-from backend.devices.errors import DeviceDisconnected, DeviceTimeout
+from backend.devices.errors import DeviceDisconnected, DeviceStalled, DeviceTimeout
 from backend.devices.protocols import LinkState, Rig
 from backend.domain.errors import RigBusyError, RigFailedError
-from backend.jobs import rigs
+from backend.jobs import rig_thread, rigs
 from backend.jobs.live import LivePicture, LiveWish
 from backend.jobs.rigs import Owner, RigPool
 from tests.scans.toy import ToyRigs
@@ -90,6 +91,56 @@ def test_a_busy_rig_refuses_other_options_at_once(place: Place) -> None:
                 ask("toy", {"seed": 9})
         blocked.set()
         work.join()
+
+
+def test_who_connects_meanwhile_never_changes_a_lent_rig(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also not if he comes while the rig that was open before is being closed."""
+    place.pool.given("toy", {"seed": 1})
+    closing = threading.Event()
+    close = place.rigs.opened[0].close
+
+    def close_slowly() -> None:
+        assert closing.wait(20)
+        close()
+
+    monkeypatch.setattr(place.rigs.opened[0], "close", close_slowly)
+    place.pool.disconnect("toy")
+
+    def capture() -> object:
+        with place.pool.lease("toy", {"seed": 2}, ADA) as lease:
+            return lease.call(lambda rig: place.rigs.opened[-1].options)
+
+    with ThreadPoolExecutor(1) as others:
+        options = others.submit(capture)
+        until(lambda: place.pool.owner("toy") == ADA)
+        place.pool.connect("toy", {"seed": 3})
+        closing.set()
+        assert options.result(20) == {"seed": 2}
+    assert place.pool.status("toy").link is RigLink.OPEN
+
+
+def test_a_rig_that_opens_too_late_changes_nothing(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rig_thread, "_patience_s", lambda rig: 0.2)
+    monkeypatch.setattr(rig_thread, "GRACE_S", 0.0)
+    hangs = threading.Event()
+
+    def hang() -> None:
+        assert hangs.wait(20)
+
+    place.rigs.faults.before_open = hang
+    with pytest.raises(DeviceStalled, match="hasn't come back from opening"):
+        place.pool.given("toy", {"seed": 1})
+    place.rigs.faults.before_open = lambda: None
+    place.pool.given("toy", {"seed": 2})
+    hangs.set()
+    until(lambda: place.rigs.opened[0].closed > 0)
+    status = place.pool.status("toy")
+    assert status.link is RigLink.OPEN
+    assert [d.device for d in status.devices][:1] == [place.rigs.opened[1].cameras["left"]]
 
 
 def test_bad_options_are_refused_at_once(place: Place) -> None:
