@@ -5,7 +5,7 @@ Milliseconds become the devices' microseconds here. A shot that fails for a pass
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import TypeVar
@@ -188,7 +188,8 @@ class Shooter:
         self._asked.clear()
         for camera in cameras:
             self._order.forget(camera)
-        self._each(cameras, "disarming", disarm)
+        with suppress(DeviceDisconnected):  # the next attempt finds it lost, and fetches it back
+            self._each(cameras, "disarming", disarm)
 
     def _once(
         self, index: int, settings: CameraSettings, cameras: Sequence[str], *, steady: bool

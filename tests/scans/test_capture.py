@@ -16,7 +16,7 @@ from backend.devices.errors import (
     FeatureError,
     IncompleteFrame,
 )
-from backend.devices.protocols import CameraSettings, TriggerSource
+from backend.devices.protocols import CameraSettings, LinkState, TriggerSource
 from backend.devices.protocols import Frame as DeviceFrame
 from backend.domain.errors import (
     CancelledError,
@@ -278,6 +278,37 @@ def test_a_lost_device_is_fetched_back_and_the_shot_taken_again(bench: Bench) ->
     assert bench.rig.cameras["right"].reconnects == 1
     assert bench.rig.cameras["left"].reconnects == 0
     assert any("right is lost, waiting for it" in live.text for live in bench.told)
+
+
+def test_a_camera_whose_loss_shows_when_it_is_disarmed_is_fetched_back(bench: Bench) -> None:
+    """First no frame comes, then nothing answers any more."""
+    bench.rig.cameras["right"] = VanishingCamera("right", bench.rig, LinkState.READY)
+    (frames,) = bench.drive(fringe_plan(FRINGES))
+    assert len(frames) == 16
+    assert bench.rig.cameras["right"].reconnects == 1
+
+
+class VanishingCamera(ToyCamera):
+    """Its third frame never comes, its cable is out."""
+
+    def get_frame(self, timeout_s: float = 2.0) -> DeviceFrame:
+        if self.frames == 3 and not self.reconnects:
+            raise DeviceTimeout(self.name, "no frame came")
+        return super().get_frame(timeout_s)
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        self._refuse_lost()
+        return super().configure(settings)
+
+    def disarm(self) -> None:
+        if self.frames == 3 and not self.reconnects:
+            self.state = LinkState.LOST
+        self._refuse_lost()
+        super().disarm()
+
+    def _refuse_lost(self) -> None:
+        if self.state is LinkState.LOST:
+            raise DeviceDisconnected(self.name, "the link is gone")
 
 
 def test_a_lost_projector_gets_its_patterns_again(bench: Bench) -> None:
