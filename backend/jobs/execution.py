@@ -44,6 +44,7 @@ from backend.jobs.stage_work import (
     perform,
     stage_errors,
 )
+from backend.jobs.sync_checks import DRIFT, SYNCHRONISATION
 from backend.jobs.views import job_view
 from backend.methods import Registry
 from backend.storage.artifacts import ArtifactStore
@@ -252,8 +253,8 @@ class JobExecution:
                 )
         with stage_errors(stage):
             outcome = conclude(stage, result, params, self._shop.store)
-        checks = (*outcome.checks, *(asdict(check) for check in verified))
-        return replace(outcome, checks=checks, device=device)
+        found = tuple(asdict(check) for check in verified) or _found_before(planned, scan)
+        return replace(outcome, checks=(*outcome.checks, *found), device=device)
 
     def _shoot(
         self,
@@ -424,6 +425,16 @@ _LAST_WORDS = {
     JobStatus.CANCELLED: ("cancelled", "The run was cancelled"),
     JobStatus.INTERRUPTED: ("interrupted", "The run was interrupted"),
 }
+
+
+def _found_before(planned: PlannedStage, scan: LoadedScan) -> tuple[dict[str, Any], ...]:
+    """Return what was found of a take's frames when they came: that holds for all that is computed of them."""
+    for run in reversed(scan.runs):
+        if (run.stage, run.take) == (planned.name, planned.take):
+            found = tuple(c for c in run.checks if c["name"] in (SYNCHRONISATION, DRIFT))
+            if found:
+                return found
+    return ()
 
 
 def _sentence(error: Exception) -> str:

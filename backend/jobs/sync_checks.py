@@ -27,6 +27,8 @@ from backend.numerics.sync_checks import drift
 DRIFT_LIMIT = 0.02
 NO_DRIFT = 0.3
 """No lamp changes by that much within a stage: the display shows something else."""
+SYNCHRONISATION, DRIFT = "synchronisation", "drift"
+"""Names of the checks that tell what was found."""
 TRIES = 3
 """How often a unit is taken before the rig counts as failed."""
 
@@ -164,14 +166,14 @@ def _synchronisation(found: Findings) -> Check:
         sentence = (
             "the cameras see too little of the projector's light to tell whether frames are late"
         )
-        return Check("synchronisation", Level.OK, sentence + again)
+        return Check(SYNCHRONISATION, Level.OK, sentence + again)
     parts = []
     if found.sets:
         parts.append(f"sets deviate by {found.deviation:.1%} at most")
     if found.markers:
         parts.append(f"markers are dark ({found.marker:.1%} of the light)")
     sentence = f"frames show what they were taken for: {', '.join(parts)}{again}"
-    return Check("synchronisation", Level.OK, sentence, found.deviation, SET_LIMIT)
+    return Check(SYNCHRONISATION, Level.OK, sentence, found.deviation, SET_LIMIT)
 
 
 def _drift(found: Findings) -> tuple[Check, ...]:
@@ -191,6 +193,4 @@ def _drift(found: Findings) -> tuple[Check, ...]:
         if abs(change) > NO_DRIFT:
             remedy = "the display lags, or something covers it; measure its latency, and take the stage again"
         sentence += f"{cause}: {remedy}"
-    return (
-        at_most("drift", abs(change), warning=DRIFT_LIMIT, failure=NO_DRIFT, sentence=sentence),
-    )
+    return (at_most(DRIFT, abs(change), warning=DRIFT_LIMIT, failure=NO_DRIFT, sentence=sentence),)

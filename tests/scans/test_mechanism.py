@@ -9,6 +9,7 @@ import pytest
 
 from backend.contract.requests import Decide, EditSettings, RedoStage, StartRun, UndoEdit
 from backend.contract.scans import ScanState
+from backend.domain.checks import Check
 from backend.domain.errors import (
     ConflictError,
     InvalidSettingError,
@@ -16,7 +17,8 @@ from backend.domain.errors import (
     StageUnavailableError,
     StaleEditError,
 )
-from backend.domain.states import Verdict
+from backend.domain.states import Level, Verdict
+from backend.jobs.capture import CaptureSession
 from tests.scans.toy_house import House, hashes, stage, statuses, waiting
 
 DONE = {"look": "done", "levels": "done", "fringes": "done", "phase": "accepted", "cloud": "done"}
@@ -300,6 +302,20 @@ def test_undoing_a_redo_brings_the_old_pictures_back(house: House) -> None:
     assert stage(again, "toy_fringes").take == 3, "new pictures, not those of the undone take"
     house.run_through(state.id)
     assert house.rigs.shots == shots + 8
+
+
+def test_what_was_found_of_frames_stays_when_they_are_looked_at_anew(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drift = Check("drift", Level.WARNING, "white has changed")
+    found = iter([(drift,)])
+    monkeypatch.setattr(CaptureSession, "finish", lambda session: next(found, ()))
+    state = house.run(house.create().id)
+    assert "drift" in {check.name for check in stage(state, "toy_look").checks}
+    shots = house.rigs.shots
+    state = house.run(house.edit(state, "toy_look", wanted_gray=99.0).id)
+    assert house.rigs.shots == shots
+    assert "drift" in {check.name for check in stage(state, "toy_look").checks}
 
 
 def test_part_moved_takes_all_pictures_again(house: House) -> None:
