@@ -183,14 +183,18 @@ class Fields:
 
     def darkest(self, exposure: float) -> Sample:
         """Return what a black field may read at most at another exposure, whatever the camera's black level is."""
-        return np.asarray(self.black.gray * np.float32(max(1.0, exposure / self.exposure)))
+        return self._longer(self.black.gray, exposure)
 
     def at_most(self, exposure: float) -> FrameSample:
         """Return what any frame may read at most at another exposure if white was white."""
         brightest = copy(self.white)
-        higher = np.maximum(self.white.gray, self.black.gray)
-        brightest.gray = higher * np.float32(max(1.0, exposure / self.exposure))
+        brightest.gray = self._longer(np.maximum(self.white.gray, self.black.gray), exposure)
         return brightest
+
+    def _longer(self, gray: Sample, exposure: float) -> Sample:
+        """Return the most that may become of a gray level at another exposure: what is 0 may be 0.9, cut off."""
+        ratio = np.float32(max(1.0, exposure / self.exposure))
+        return np.asarray(gray * ratio + (ratio - 1))
 
     def at_least(self, exposure: float) -> FrameSample:
         """Return what any frame reads at least at another exposure if black was black."""

@@ -131,6 +131,7 @@ def _methods() -> dict[str, tuple[tuple[Shot, ...], ...]]:
         "coarse fringes": (burst(fringes(4, (0.9, 4.0))),),
         "three coarse steps": (burst(fringes(3, (0.5, 1.0))),),
         "exposures": (ladder,),
+        "short and long": (burst(fringes(4, (19.0, 20.0)), 1), burst(fringes(4, (19.0, 20.0)), 100)),
         "under a mask": (burst(fringes(4), mask=mask), burst(CODE, mask=mask)),
         "Gray code and stripes": (burst(list(code_patterns(projector, CodeCaptureParams()))),),
         "one pair": (burst(list(gray_code("x", 2))),),
@@ -161,6 +162,13 @@ SCENES: dict[str, dict[str, Any]] = {
     "12 bit, noisy": {"bit_depth": 12, "read_noise_e": 60.0},
     "poor contrast": {"contrast_ratio": 15.0},
     "blur and glare": {"projector_blur_px": 3.0, "glare_share": 0.1},
+    "dark reads 0": {"black_level_gray": 0.0, "read_noise_e": 3.0, "ambient_e_per_ms": 3.0},
+    "dark reads 0, hardly any light": {
+        "black_level_gray": 0.0,
+        "read_noise_e": 3.0,
+        "ambient_e_per_ms": 0.0,
+        "white_e_per_ms": 1.0,
+    },
 }
 
 
@@ -179,6 +187,7 @@ def test_no_false_alarm_whatever_is_seen(scene: str, store: LocalArtifactStore) 
         for method in (
             "three steps",
             "exposures",
+            "short and long",
             "under a mask",
             "search for an exposure",
             "ramp",
