@@ -1,5 +1,6 @@
 """A rig put together from single devices: any cameras, any projector."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,9 +20,10 @@ from backend.domain.rig import CameraFacts, ProjectorFacts, RigCalibration, RigF
 class SensorFacts:
     """What a camera's data sheet or a measurement says, and the camera itself doesn't."""
 
-    bit_depth: int = 8
+    bit_depth: int | None = None
+    """None: as the camera's pixel format says."""
     black_level_gray: float = 0.0
-    """What a dark pixel reads, at `bit_depth`."""
+    """What a dark pixel reads, at the camera's depth."""
     full_well_e: float = 10_000.0
     """Electrons at full scale, at gain 0 dB."""
     read_noise_e: float = 10.0
@@ -157,7 +159,7 @@ class AssembledRig:
         return CameraFacts(
             width_px=width_px,
             height_px=height_px,
-            bit_depth=sensor.bit_depth,
+            bit_depth=self._bit_depth(name),
             exposure_min_ms=shortest_us / 1000.0,
             exposure_max_ms=longest_us / 1000.0,
             black_level_gray=sensor.black_level_gray,
@@ -165,6 +167,20 @@ class AssembledRig:
             read_noise_e=sensor.read_noise_e,
             gain_max_db=can.gain_db.max if gain_db is None else min(gain_db, can.gain_db.max),
         )
+
+    def _bit_depth(self, name: str) -> int:
+        said, pixel_format = (
+            self._sensors[name].bit_depth,
+            self._cameras[name].settings.pixel_format,
+        )
+        digits = re.search(r"\d+", pixel_format or "")
+        delivered = int(digits[0]) if digits else said or 8
+        if said not in (None, delivered):
+            raise RigConfigError(
+                f"{name}: the camera delivers {pixel_format}, {delivered} bits, and its sensor entry says bit_depth {said};"
+                " leave bit_depth out, or choose another pixel_format"
+            )
+        return delivered
 
     def _exposures_us(self, name: str) -> tuple[float, float]:
         """Return the shortest and the longest exposure that device, wiring and owner allow."""

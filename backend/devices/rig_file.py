@@ -48,7 +48,7 @@ class _Part(BaseModel):
 class SensorEntry(_Part):
     """A camera's data sheet."""
 
-    bit_depth: int = Field(8, ge=8, le=16)
+    bit_depth: int | None = Field(None, ge=8, le=16)
     black_level_gray: float = Field(0.0, ge=0)
     full_well_e: float = Field(10_000.0, gt=0)
     read_noise_e: float = Field(10.0, ge=0)

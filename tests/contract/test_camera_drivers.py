@@ -708,6 +708,13 @@ def test_what_a_camera_refuses_leaves_the_old_settings(monkeypatch):
     assert made.read() == before
 
 
+def test_a_tone_curve_that_was_left_behind_is_taken_off():
+    _, features = controls({**OLD_NAMES, "Gamma": (0.45, 0, 4, 0, "")}, TRIGGER)
+    assert features.numbers["Gamma"] == 1.0
+    _, locked = controls({**OLD_NAMES, "Gamma": (0.45, 0, 0.5, 0, "")}, TRIGGER)
+    assert locked.numbers["Gamma"] == 0.45
+
+
 def test_triggers_that_would_hold_frames_back_are_switched_off():
     made, features = controls(OLD_NAMES, TRIGGER)
     assert features.log[: features.log.index(("TriggerSelector", "FrameStart"))] == [

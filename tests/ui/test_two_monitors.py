@@ -1,5 +1,6 @@
 """The whole application on two monitors: server, kiosk and GigE Vision cameras that see what the second one shows."""
 
+import re
 import signal
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -212,6 +213,18 @@ def test_a_camera_that_is_killed_in_mid_scan_and_comes_back(
     program.stop()
 
 
+def test_a_pixel_format_that_the_cameras_lack_is_one_sentence(
+    desktop: Desktop, hardware: Program, station: Station, window: Window
+) -> None:
+    text = (desktop.folder / "room.yaml").read_text()
+    file = desktop.folder / "odd.yaml"
+    file.write_text(text.replace("driver: aravis", "driver: aravis\n    pixel_format: Mono9"))
+    station.add_rig(file, "odd")
+    error = station.scan("odd", **BRIEF).start().end()["error"]
+    assert re.search(r"Mono9 is not one of Mono8", error or ""), error
+    assert station.scan("room", **BRIEF).start("fringe_capture").end()["error"] is None
+
+
 def ends_or_goes_on(scan: Scan) -> None:
     """Check that a disturbed scan went on, or ended with one sentence and goes on when told to; nothing is lost."""
     error = scan.end()["error"]
@@ -245,6 +258,14 @@ def shrink_and_back(window: Window, desktop: Desktop) -> None:
     window.command("Browser.setWindowBounds", windowId=number, bounds={"windowState": "fullscreen"})
 
 
+def open_a_second_page(window: Window, desktop: Desktop) -> None:
+    pages = window.page.context.pages
+    window.command("Target.createTarget", url=window.page.url, background=True)
+    second = wait_for(lambda: set(window.page.context.pages) - set(pages), "the second page").pop()
+    second.get_by_text("Another page is this projector already").wait_for()
+    second.close()
+
+
 def pull_the_cable_and_plug_in(window: Window, desktop: Desktop) -> None:
     desktop.unplug()
     window.page.wait_for_timeout(500)
@@ -258,7 +279,10 @@ def pull_the_cable_and_plug_in(window: Window, desktop: Desktop) -> None:
 
 @pytest.mark.parametrize(
     "disturb",
-    [reload, freeze, zoom_and_back, shrink_and_back, pull_the_cable_and_plug_in],
+    [
+        *(reload, freeze, zoom_and_back, shrink_and_back),
+        *(open_a_second_page, pull_the_cable_and_plug_in),
+    ],
     ids=lambda d: d.__name__,
 )
 def test_a_page_disturbed_in_mid_scan(

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from backend.devices import driver_loading, plug_ins
+from backend.devices.assembled import AssembledRig, SensorFacts
 from backend.devices.drivers.aravis_camera import AravisCamera
 from backend.devices.drivers.page_projector import PageProjector
 from backend.devices.errors import RigConfigError, RigNotFoundError
 from backend.devices.pages import PageDesk
 from backend.devices.rig_file import RigFile, assemble
 from backend.devices.rig_shelf import RigShelf
+from backend.devices.sim import create_rig
 
 BENCH = """
 title: Bench by the window
@@ -186,3 +188,23 @@ def test_drivers_of_packages_are_found_and_a_broken_one_stops_only_its_rig(
     with pytest.raises(RigConfigError, match="left: camera gone can't be loaded"):
         driver_loading.make_camera("left", "gone", {})
     assert driver_loading.make_camera("left", "aravis", {"address": "192.0.2.2"}).name == "left"
+
+
+@pytest.mark.parametrize("said", [None, 12])
+def test_depth_is_the_cameras(said: int | None) -> None:
+    with _twelve_bits(said) as rig:
+        assert rig.facts().cameras["left"].bit_depth == 12
+
+
+def test_another_depth_than_the_cameras_is_refused() -> None:
+    with (
+        _twelve_bits(8) as rig,
+        pytest.raises(RigConfigError, match="left: the camera delivers Mono12, 12 bits"),
+    ):
+        rig.facts()
+
+
+def _twelve_bits(said: int | None) -> AssembledRig:
+    simulated = create_rig({"scene": "plane", "size": "64x48", "projector_size": "64x48", "bit_depth": 12})  # fmt: skip
+    sensors = dict.fromkeys(simulated.cameras, SensorFacts(said))
+    return AssembledRig("bench", simulated.cameras, simulated.projector, sensors=sensors)

@@ -135,6 +135,7 @@ class SfncControls:
             ("GainAuto", "Off"), ("GainSelector", "All"),
         ):  # fmt: skip
             self._set_if_possible(name, value)
+        self._make_linear()
         self._choose_format()
         self._read_region()
         for selector in features.choices("TriggerSelector"):  # another one may hold frames back
@@ -143,6 +144,12 @@ class SfncControls:
         self._set_if_possible("TriggerSelector", "FrameStart")
         self._set_if_possible("TriggerActivation", "RisingEdge")
         self._set_trigger(self._sources()[0])
+
+    def _make_linear(self) -> None:
+        """Take a tone curve off that a viewer left behind: fringes bend with it. One that is off can't be written."""
+        if self._features.has("Gamma") and self._features.number("Gamma") != 1.0:
+            with suppress(Exception):
+                self._features.set_number("Gamma", 1.0)
 
     def _choose_format(self) -> None:
         formats, wanted = self._formats(), self._options.pixel_format
