@@ -131,7 +131,7 @@ def _methods() -> dict[str, tuple[tuple[Shot, ...], ...]]:
         "coarse fringes": (burst(fringes(4, (0.9, 4.0))),),
         "three coarse steps": (burst(fringes(3, (0.5, 1.0))),),
         "exposures": (ladder,),
-        "short and long": (burst(fringes(4, (19.0, 20.0)), 1), burst(fringes(4, (19.0, 20.0)), 100)),
+        "short and long": (burst(fringes(4, (17.0, 18.0)), 1), burst(fringes(4, (17.0, 18.0)), 100)),
         "under a mask": (burst(fringes(4), mask=mask), burst(CODE, mask=mask)),
         "Gray code and stripes": (burst(list(code_patterns(projector, CodeCaptureParams()))),),
         "one pair": (burst(list(gray_code("x", 2))),),
