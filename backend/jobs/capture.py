@@ -244,7 +244,7 @@ class CaptureSession:
                 raise OutOfSync(
                     first.camera,
                     f"{first.sentence}, and taken again it wasn't right in {TRIES} tries: the display is late, torn or"
-                    f" not lit; {self.shooter.way_out}",
+                    f" not lit, or the room's light has changed; {self.shooter.way_out}",
                 )
             self.control.note(f"{violation.camera}: {violation.sentence}; taken again")
             log.warning(

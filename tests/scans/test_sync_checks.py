@@ -265,6 +265,7 @@ def test_a_display_that_is_never_right_is_refused_with_a_sentence(
     sentence = caught.value.sentence
     assert sentence.startswith(("left: ", "right: "))
     assert "right in 3 tries" in sentence
+    assert "or the room's light has changed" in sentence
     assert "unglare rigs latency --rig doubtful" in sentence
     assert "\n" not in sentence
 
