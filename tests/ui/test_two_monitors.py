@@ -259,10 +259,12 @@ def shrink_and_back(window: Window, desktop: Desktop) -> None:
 
 
 def open_a_second_page(window: Window, desktop: Desktop) -> None:
-    pages = window.page.context.pages
-    window.command("Target.createTarget", url=window.page.url, background=True)
-    second = wait_for(lambda: set(window.page.context.pages) - set(pages), "the second page").pop()
-    second.get_by_text("Another page is this projector already").wait_for()
+    with window.page.context.expect_page() as opened:
+        window.command("Target.createTarget", url=window.page.url, background=True)
+    second = opened.value
+    # A window in the background draws nothing, so what waits for animation frames would wait for ever.
+    refused = "() => document.body.innerText.includes('Another page is this projector already')"
+    wait_for(lambda: second.evaluate(refused), "the refusal of the second page")
     second.close()
 
 
