@@ -158,11 +158,12 @@ def test_injected_lag_is_found_and_the_scan_is_as_good(
 ) -> None:
     with simulated(desktop, station, "late", LATE_CAMERAS, "--lag-ms=60"):
         station.give_page_to("late")
-        station.post("/api/rigs/late/latency", repetitions=3)
+        station.post("/api/rigs/late/latency", repetitions=10)
         wait_for(lambda: station.get("/api/rigs/late/latency"), "the latency calibration")
         found = station.get("/api/rigs/late/latency")
         assert found["kept"], found["note"]
-        assert 60.0 <= found["settle_ms"] <= 110.0  # with the frame period that is added for safety
+        # The lag, up to half a frame of the steps that are tried, and the frame that is added for safety.
+        assert 60.0 <= found["settle_ms"] <= 90.0
         assert has_good_columns(station.scan("late", exposures={"steps": 8}).start())
 
 
