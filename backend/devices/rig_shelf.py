@@ -14,6 +14,7 @@ from backend.devices.options import DisplaySize
 from backend.devices.pages import PageDesk
 from backend.devices.protocols import Rig
 from backend.devices.rig_file import CalibrationEntry, RigFile, assemble, read_yaml
+from backend.devices.whole_files import write_whole
 
 CALIBRATION_SUFFIX = ".calibration.yaml"
 """Beside a rig's file: where its devices are, if the file doesn't say it itself."""
@@ -152,11 +153,8 @@ class RigShelf:
         text = yaml.safe_dump(
             entry.model_dump(mode="json"), sort_keys=False, default_flow_style=None
         )
-        path = self.calibration_path(name)
-        path.write_text(
-            f"# from {source}; x_device = R x_world + t_mm in mm, as OpenCV has it\n{text}", "utf-8"
-        )
-        return path
+        head = f"# from {source}; x_device = R x_world + t_mm in mm, as OpenCV has it\n"
+        return write_whole(self.calibration_path(name), head + text)
 
     def _with_latency(self, name: str, file: RigFile) -> RigFile:
         """Let the projector wait as long as was measured, unless its entry says how long or has changed since."""
@@ -205,21 +203,13 @@ class RigShelf:
             )
         file = RigFile.read(source)
         assemble(name, file, self._desk)
-        target = self._folder / f"{name}.yaml"
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            text = source.read_text("utf-8")
-            named = _NAMED_CALIBRATION.search(text)
-            if named is not None and file.calibration is not None:
-                # The name of a file counts from where the rig file was: here it would lead nowhere.
-                self._write_calibration(name, file.calibration, str(source))
-                text = text.replace(named.group(), f"# calibration: see {name}{CALIBRATION_SUFFIX}")
-            target.write_text(text, "utf-8")
-        except OSError as error:
-            raise RigConfigError(
-                f"rig file {target} can't be written ({error.strerror}); check the data folder's rights and space"
-            ) from error
-        return KeptRig(name, target)
+        text = source.read_text("utf-8")
+        named = _NAMED_CALIBRATION.search(text)
+        if named is not None and file.calibration is not None:
+            # The name of a file counts from where the rig file was: here it would lead nowhere.
+            self._write_calibration(name, file.calibration, str(source))
+            text = text.replace(named.group(), f"# calibration: see {name}{CALIBRATION_SUFFIX}")
+        return KeptRig(name, write_whole(self._folder / f"{name}.yaml", text))
 
     def remove(self, name: str) -> Path:
         """Take a file off the shelf, and calibration and latency, which needn't hold for the next rig of that name.

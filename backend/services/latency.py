@@ -23,6 +23,7 @@ from backend.devices.protocols import (
     TriggerSource,
 )
 from backend.devices.rig_shelf import ASSUMED_REFRESH_HZ, LATENCY_SUFFIX
+from backend.devices.whole_files import write_whole
 from backend.domain.errors import StageFailedError
 from backend.domain.shots import Progress
 from backend.jobs.rigs import Owner
@@ -143,9 +144,8 @@ class Latency:
 
     def keep(self, folder: Path, rig: str) -> Path:
         """Write it where the rig's file is."""
-        path = folder / f"{rig}{LATENCY_SUFFIX}"
-        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
-        return path
+        text = json.dumps(asdict(self), indent=1) + "\n"
+        return write_whole(folder / f"{rig}{LATENCY_SUFFIX}", text)
 
     @classmethod
     def kept(cls, folder: Path, rig: str) -> "Latency | None":

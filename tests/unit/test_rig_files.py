@@ -15,6 +15,7 @@ from backend.devices.pages import PageDesk
 from backend.devices.rig_file import RigFile, assemble
 from backend.devices.rig_shelf import RigShelf
 from backend.devices.sim import create_rig
+from backend.devices.whole_files import write_whole
 
 BENCH = """
 title: Bench by the window
@@ -188,6 +189,14 @@ def test_drivers_of_packages_are_found_and_a_broken_one_stops_only_its_rig(
     with pytest.raises(RigConfigError, match="left: camera gone can't be loaded"):
         driver_loading.make_camera("left", "gone", {})
     assert driver_loading.make_camera("left", "aravis", {"address": "192.0.2.2"}).name == "left"
+
+
+def test_a_file_that_cannot_be_written_leaves_the_one_before(tmp_path: Path) -> None:
+    path = written(tmp_path, "before")
+    path.with_name(f".{path.name}.partial").mkdir()
+    with pytest.raises(RigConfigError, match="can't be written"):
+        write_whole(path, "after")
+    assert path.read_text() == "before"
 
 
 @pytest.mark.parametrize("said", [None, 12])
