@@ -300,21 +300,26 @@ class _Bench:
         found: dict[int, list[list[float]]] = defaultdict(list)
         what = "black to white" if target else "white to black"
 
-        def complete(times: int, steady_s: float, step: int) -> bool:
+        def complete(step: int, *, times: int, steady_s: float, done: float) -> bool:
             delay_ms = step * step_ms
             _refuse_endless(delay_ms, what)
-            done = min(delay_ms / 150.0, 0.9) / 2 + (0.05 if times > 1 else 0.0)
-            progress(
-                done + (0.0 if target else 0.5),
-                f"{what}, {delay_ms:.0f} ms after the acknowledgement",
-            )
+            share = min(done, 0.98) / 2 + (0.0 if target else 0.5)
+            progress(share, f"{what}, {delay_ms:.0f} ms after the acknowledgement")
             for _ in range(times):
                 found[step].append(self._shares(target, steady, delay_ms, steady_s))
             return min(map(min, found[step])) >= COMPLETE
 
-        first = _first_agreeing(partial(complete, 1, _STEADY_S), 0)
+        def once(step: int) -> bool:
+            return complete(step, times=1, steady_s=_STEADY_S, done=step * step_ms / 1000.0)
+
+        first = _first_agreeing(once, 0)
         steady_s = min(_STEADY_S, _LEAST_STEADY_S + _STEADY_CHANGES * first * step_ms / 1000.0)
-        _first_agreeing(partial(complete, repetitions, steady_s), first)
+
+        def often(step: int) -> bool:
+            done = 0.4 + 0.6 * (step - first) / _AGREEING
+            return complete(step, times=repetitions, steady_s=steady_s, done=done)
+
+        _first_agreeing(often, first)
         return _settling_of(found, step_ms)
 
     def _shares(

@@ -150,7 +150,15 @@ def test_the_slowest_of_many_changes_counts() -> None:
 def test_only_delays_that_may_be_long_enough_are_repeated() -> None:
     clock = VirtualTime()
     screen = LaggingScreen(0.060, clock, refresh_hz=60.0)
-    latency.latency_of(screen, [Camera("left", screen)], _silent, repetitions=10, clock=clock)
+    told: list[float] = []
+    latency.latency_of(
+        screen,
+        [Camera("left", screen)],
+        lambda done, text="": told.append(done),
+        repetitions=10,
+        clock=clock,
+    )
+    assert told == sorted(told)
     too_short = 8  # half periods of 60 Hz in 60 ms
     assert 2 * 3 * 10 < len(screen.changes) / 2 <= 2 * (too_short + 3 + 3 * 10) + 3
     assert clock.now_s() - 100.0 < 60.0
