@@ -1,6 +1,7 @@
 """Libraries that come with an extra of this package and may be missing."""
 
 import importlib
+import re
 import warnings
 from typing import Any
 
@@ -24,5 +25,11 @@ def imported(device: str, module: str, extra: str) -> Any:
         library = module.partition(".")[0]
         raise DeviceNotFound(
             device,
-            f"{library} isn't installed or can't be loaded ({error}); run: pip install 'unglare[{extra}]'",
+            f"{library} isn't installed or can't be loaded ({error}); run: {_cure(error, extra)}",
         ) from error
+
+
+def _cure(error: ImportError, extra: str) -> str:
+    """Say what to install: some wheels are linked against Python's own shared library, which Debian ships apart."""
+    missing = re.search(r"libpython[\d.]+\d(?=\.so)", str(error))
+    return f"apt-get install {missing[0]}" if missing else f"pip install 'unglare[{extra}]'"
