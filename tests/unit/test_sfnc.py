@@ -8,7 +8,7 @@ import pytest
 from backend.devices.drivers.extras import _cure
 from backend.devices.drivers.sfnc import SfncControls, SfncOptions
 from backend.devices.errors import FeatureError, UnsupportedFeature
-from backend.devices.protocols import Range, TriggerSource
+from backend.devices.protocols import CameraSettings, Range, TriggerSource
 
 Numbers = Mapping[str, tuple[float, float, float, float, str]]
 """Value, smallest, largest, step, unit."""
