@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import TypeAdapter
 
+from backend.devices.errors import DeviceError
 from backend.devices.protocols import (
     CameraCapabilities,
     CameraSettings,
@@ -27,6 +28,7 @@ from backend.devices.whole_files import write_whole
 from backend.domain.errors import StageFailedError
 from backend.domain.shots import Progress
 from backend.jobs.rigs import Owner
+from backend.jobs.shooting import ATTEMPTS
 from backend.numerics.settling import COMPLETE, Settling, changing_pixels, share_of_change
 from backend.services.context import Context
 
@@ -234,7 +236,7 @@ class _Bench:
             projector.settle_ms = 0.0
         try:
             self._arm()
-            steady = {level: self._pictures(level, _STEADY_S) for level in (0, 255)}
+            steady = {level: self._changed(level, 0.0, level, _STEADY_S) for level in (0, 255)}
             self._refuse_darkness(steady)
             changes = {
                 target: self._settling(target, steady, repetitions, progress) for target in (255, 0)
@@ -242,8 +244,7 @@ class _Bench:
         finally:
             if hasattr(projector, "settle_ms"):
                 projector.settle_ms = known
-            for camera in self._cameras:
-                self._ask(camera.name, "disarming", camera.disarm)
+            self._disarm()
             self._blank(0)
         return self._latency(changes[255], changes[0])
 
@@ -261,6 +262,24 @@ class _Bench:
             )
             self._ask(camera.name, "setting its exposure", partial(camera.configure, wanted))
             self._ask(camera.name, "arming", camera.arm)
+
+    def _disarm(self) -> None:
+        for camera in self._cameras:
+            self._ask(camera.name, "disarming", camera.disarm)
+
+    def _changed(self, start: int, steady_s: float, target: int, delay_s: float) -> list[Gray]:
+        """Change from one level to another and take the pictures; again where one is lost on its way."""
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                self._blank(start)
+                self._clock.sleep(steady_s)
+                return self._pictures(target, delay_s)
+            except DeviceError as error:
+                if not error.retryable or attempt == ATTEMPTS:
+                    raise
+                self._disarm()
+                self._arm()  # throws away what the other cameras took
+        raise AssertionError("the last attempt returns or raises")
 
     def _blank(self, level: int) -> None:
         self._ask(self._projector.name, "showing a pattern", lambda: self._projector.blank(level))
@@ -326,9 +345,7 @@ class _Bench:
         self, target: int, steady: Mapping[int, list[Gray]], delay_ms: float, steady_s: float
     ) -> list[float]:
         start = 255 - target
-        self._blank(start)
-        self._clock.sleep(steady_s)
-        pictures = self._pictures(target, delay_ms / 1000.0)
+        pictures = self._changed(start, steady_s, target, delay_ms / 1000.0)
         return [
             share_of_change(gray, before, after, _lit(dark, bright))
             for gray, before, after, dark, bright in zip(

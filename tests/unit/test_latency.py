@@ -1,11 +1,13 @@
 """The latency calibration, on a screen that lags by a known time and cameras that integrate its light."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from backend.devices.drivers.page_projector import PageProjector
+from backend.devices.errors import IncompleteFrame
 from backend.devices.pages import PageDesk
 from backend.devices.protocols import (
     CameraCapabilities,
@@ -145,6 +147,39 @@ def test_the_slowest_of_many_changes_counts() -> None:
         screen, [Camera("left", screen)], _silent, repetitions=10, clock=clock
     )
     assert found.settle_ms >= 30.0 + 1000 * PERIOD_S
+
+
+class LossyCamera(Camera):
+    """Loses a picture now and then."""
+
+    taken = 0
+
+    def get_frame(self, timeout_s: float = 2.0) -> Frame:
+        self.taken += 1
+        if self.taken % 11 == 0:
+            raise IncompleteFrame(self.name, "frame 11 arrived with packets missing; take it again")
+        return super().get_frame(timeout_s)
+
+
+def test_a_lost_picture_is_taken_again() -> None:
+    clock = VirtualTime()
+    screen = LaggingScreen(0.020, clock)
+    cameras = [LossyCamera("left", screen), Camera("right", screen)]
+    found = latency.latency_of(screen, cameras, _silent, repetitions=10, clock=clock)
+    assert found.settle_ms == measured(0.020).settle_ms
+
+
+def test_a_camera_that_loses_every_picture_is_named() -> None:
+    clock = VirtualTime()
+    screen = LaggingScreen(0.020, clock)
+    camera = LossyCamera("left", screen)
+    camera.get_frame = partial(_lost, "left")  # type: ignore[method-assign]
+    with pytest.raises(IncompleteFrame, match="left"):
+        latency.latency_of(screen, [camera], _silent, repetitions=10, clock=clock)
+
+
+def _lost(name: str, timeout_s: float = 2.0) -> Frame:
+    raise IncompleteFrame(name, "frame 1 arrived with packets missing; take it again")
 
 
 def test_only_delays_that_may_be_long_enough_are_repeated() -> None:
