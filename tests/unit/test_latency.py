@@ -1,6 +1,5 @@
 """The latency calibration, on a screen that lags by a known time and cameras that integrate its light."""
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -169,17 +168,20 @@ def test_a_lost_picture_is_taken_again() -> None:
     assert found.settle_ms == measured(0.020).settle_ms
 
 
+class LosingCamera(Camera):
+    """Loses every picture."""
+
+    def get_frame(self, timeout_s: float = 2.0) -> Frame:
+        raise IncompleteFrame(self.name, "frame 1 arrived with packets missing; take it again")
+
+
 def test_a_camera_that_loses_every_picture_is_named() -> None:
     clock = VirtualTime()
     screen = LaggingScreen(0.020, clock)
-    camera = LossyCamera("left", screen)
-    camera.get_frame = partial(_lost, "left")  # type: ignore[method-assign]
     with pytest.raises(IncompleteFrame, match="left"):
-        latency.latency_of(screen, [camera], _silent, repetitions=10, clock=clock)
-
-
-def _lost(name: str, timeout_s: float = 2.0) -> Frame:
-    raise IncompleteFrame(name, "frame 1 arrived with packets missing; take it again")
+        latency.latency_of(
+            screen, [LosingCamera("left", screen)], _silent, repetitions=10, clock=clock
+        )
 
 
 def test_only_delays_that_may_be_long_enough_are_repeated() -> None:
