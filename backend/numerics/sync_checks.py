@@ -92,11 +92,10 @@ def step_set(
         return None
     valid = _all_valid(frames)
     stack = np.stack([f.gray for f in frames])
-    background, in_phase, minus_quadrature = np.tensordot(solve, stack, axes=1)
+    _, in_phase, minus_quadrature = np.tensordot(solve, stack, axes=1)
     residual = np.tensordot(projector, stack, axes=1)
     residual -= _bent(residual, in_phase, minus_quadrature, shifts_rad, projector, valid)
     moved = _Light.of(valid, in_phase, minus_quadrature)
-    del background
     return _judged(residual, moved, frames, before, tell_frame=len(frames) > 4)
 
 

@@ -20,8 +20,8 @@ from backend.devices.drivers.aravis_library import (
     listed_devices,
     on_control_lost,
 )
-from backend.devices.drivers.library_camera import LibraryCamera
-from backend.devices.drivers.sfnc import SfncControls, SfncOptions, bits_of, gray_of
+from backend.devices.drivers.sfnc import SfncOptions, bits_of, gray_of
+from backend.devices.drivers.sfnc_camera import SfncCamera
 from backend.devices.errors import (
     DeviceBusy,
     DeviceError,
@@ -38,7 +38,6 @@ from backend.devices.protocols import (
     DeviceInfo,
     Frame,
     LinkState,
-    TriggerSource,
 )
 
 _SOCKET_BUFFER_BYTES = 8 << 20
@@ -46,8 +45,6 @@ _SOCKET_BUFFER_BYTES = 8 << 20
 _RETENTION_US = 400_000
 """How long a frame waits for packets: Aravis' 100 ms are too few for a machine that is busy."""
 _FEWEST_BUFFERS = 4
-_FREE_RUN_BUFFERS = 3
-"""So few that what waits is soon thrown away."""
 _SUCCESS, _TIMED_OUT = 0, 2  # states of a buffer
 _RANGE_CHECKED = 1
 _ORDINARY_SOCKET = 1
@@ -85,18 +82,18 @@ def create_camera(name: str, options: Mapping[str, Any]) -> "AravisCamera":
     return AravisCamera(name, read_options(AravisOptions, name, options))
 
 
-class AravisCamera(LibraryCamera):
+class AravisCamera(SfncCamera):
     """A `Camera`. One thread at a time, except for `abort` and `state`."""
 
     def __init__(self, name: str, options: AravisOptions) -> None:
         where = options.address or options.serial
-        super().__init__(name, DeviceInfo("", "", options.serial, driver="aravis", address=where))
+        info = DeviceInfo("", "", options.serial, driver="aravis", address=where)
+        super().__init__(name, info, options, fewest_buffers=_FEWEST_BUFFERS)
         self._options = options
         self._camera = 0
         self._stream = 0
         """Addresses of GObjects; 0: there is none."""
         self._lost_callback: object = None
-        self._controls: SfncControls | None = None
         self._counter = FrameCounter()
 
     # ------------------------------------------------------------ life
@@ -108,14 +105,7 @@ class AravisCamera(LibraryCamera):
         device = library.plain("arv_camera_get_device", self._camera)
         _, self._lost_callback = on_control_lost(device, self._note_loss)
         features = AravisFeatures(self._camera)
-        self._controls = SfncControls(
-            self.name,
-            features,
-            self._options,
-            buffered_frames=_FREE_RUN_BUFFERS,
-            hardware_timestamp=True,
-        )
-        self._controls.prepare()
+        self._prepare(features, hardware_timestamp=True)
         self._set_packet_size(library)
         return self._who(features), self._controls.capabilities(), self._controls.read()
 
@@ -192,14 +182,9 @@ class AravisCamera(LibraryCamera):
 
     # ------------------------------------------------------------ settings and frames
 
-    def _apply(self, wanted: CameraSettings) -> CameraSettings:
-        assert self._controls is not None, "made by _connect"
-        return self._controls.apply(wanted, self._settings)
-
     def _start(self, n_frames: int | None) -> None:
-        free_run = self._settings.trigger is TriggerSource.FREE_RUN
-        count = _FREE_RUN_BUFFERS if free_run else max(_FEWEST_BUFFERS, (n_frames or 0) + 2)
-        self._provide_buffers(int(self._call("arv_camera_get_payload")), count)
+        payload = int(self._call("arv_camera_get_payload"))
+        self._provide_buffers(payload, self._buffers_for(n_frames))
         self._call("arv_camera_start_acquisition")
 
     def _provide_buffers(self, payload: int, count: int) -> None:

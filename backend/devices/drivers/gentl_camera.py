@@ -21,8 +21,8 @@ from typing import Any
 from pydantic import Field
 
 from backend.devices.drivers.extras import imported
-from backend.devices.drivers.library_camera import LibraryCamera
-from backend.devices.drivers.sfnc import SfncControls, SfncOptions, bits_of, gray_of
+from backend.devices.drivers.sfnc import SfncOptions, bits_of, gray_of
+from backend.devices.drivers.sfnc_camera import SfncCamera
 from backend.devices.errors import (
     DeviceBusy,
     DeviceError,
@@ -39,7 +39,6 @@ from backend.devices.protocols import (
     CameraSettings,
     DeviceInfo,
     Frame,
-    TriggerSource,
 )
 
 log = logging.getLogger(__name__)
@@ -47,7 +46,6 @@ log = logging.getLogger(__name__)
 PRODUCERS_PATH = "GENICAM_GENTL64_PATH"
 """Environment variable in which vendors' installers list the folders of their producers."""
 _FEWEST_BUFFERS = 6
-_FREE_RUN_BUFFERS = 3
 _LOOK_MS = 1000
 _READY_POLL_S = 0.001
 _TRIGGER_WAIT = "FrameTriggerWait"
@@ -74,16 +72,16 @@ def create_camera(name: str, options: Mapping[str, Any]) -> "GentlCamera":
     return GentlCamera(name, read_options(GentlOptions, name, options))
 
 
-class GentlCamera(LibraryCamera):
+class GentlCamera(SfncCamera):
     """A `Camera`. One thread at a time, except for `abort` and `state`."""
 
     def __init__(self, name: str, options: GentlOptions) -> None:
-        super().__init__(name, DeviceInfo("", "", options.serial, driver="gentl"))
+        info = DeviceInfo("", "", options.serial, driver="gentl")
+        super().__init__(name, info, options, fewest_buffers=_FEWEST_BUFFERS)
         self._options = options
         self._producer: _Producer | None = None
         self._acquirer: Any = None
         self._features: GentlFeatures | None = None
-        self._controls: SfncControls | None = None
         self._counter = FrameCounter(first_block=None)
         self._incomplete = threading.Event()
 
@@ -102,15 +100,8 @@ class GentlCamera(LibraryCamera):
             self._acquirer.Events.INCOMPLETE_BUFFER, _callback(self.name, self._incomplete.set)
         )
         self._features = GentlFeatures(self._acquirer.remote_device.node_map)
-        self._controls = SfncControls(
-            self.name,
-            self._features,
-            options,
-            buffered_frames=_FREE_RUN_BUFFERS,
-            hardware_timestamp=self._features.has("TimestampLatch")
-            or self._features.has("GevTimestampTickFrequency"),
-        )
-        self._controls.prepare()
+        clocks = ("TimestampLatch", "GevTimestampTickFrequency")
+        self._prepare(self._features, hardware_timestamp=any(map(self._features.has, clocks)))
         return self._who(), self._controls.capabilities(), self._controls.read()
 
     def _created(self, producer: "_Producer") -> Any:
@@ -155,13 +146,8 @@ class GentlCamera(LibraryCamera):
 
     # ------------------------------------------------------------ settings and frames
 
-    def _apply(self, wanted: CameraSettings) -> CameraSettings:
-        assert self._controls is not None, "made by _connect"
-        return self._controls.apply(wanted, self._settings)
-
     def _start(self, n_frames: int | None) -> None:
-        free_run = self._settings.trigger is TriggerSource.FREE_RUN
-        wanted = _FREE_RUN_BUFFERS if free_run else max(_FEWEST_BUFFERS, (n_frames or 0) + 2)
+        wanted = self._buffers_for(n_frames)
         self._acquirer.num_buffers = max(wanted, self._acquirer.min_num_buffers)
         self._counter.restart()
         self._incomplete.clear()

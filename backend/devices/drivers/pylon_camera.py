@@ -17,8 +17,8 @@ import cv2
 from pydantic import model_validator
 
 from backend.devices.drivers.extras import imported
-from backend.devices.drivers.library_camera import LibraryCamera
-from backend.devices.drivers.sfnc import SfncControls, SfncOptions, bits_of, gray_of
+from backend.devices.drivers.sfnc import SfncOptions, bits_of, gray_of
+from backend.devices.drivers.sfnc_camera import SfncCamera
 from backend.devices.errors import (
     DeviceBusy,
     DeviceError,
@@ -35,15 +35,12 @@ from backend.devices.protocols import (
     CameraSettings,
     DeviceInfo,
     Frame,
-    TriggerSource,
 )
 
 _NETWORK, _USB, _EMULATED = "BaslerGigE", "BaslerUsb", "BaslerCamEmu"
 _EMULATED_COUNT = "PYLON_CAMEMU"
 """Environment variable: how many cameras pylon emulates; read when it first looks for them."""
 _FEWEST_BUFFERS = 10
-_FREE_RUN_BUFFERS = 3
-"""So few that what waits is soon thrown away."""
 _TICKS_PER_S = 1e9
 _CONTROLLED = "another"
 """Word in pylon's sentences about cameras that another application or client has opened."""
@@ -82,17 +79,16 @@ def create_camera(name: str, options: Mapping[str, Any]) -> "PylonCamera":
     return PylonCamera(name, read_options(PylonOptions, name, options))
 
 
-class PylonCamera(LibraryCamera):
+class PylonCamera(SfncCamera):
     """A `Camera`. One thread at a time, except for `abort` and `state`."""
 
     def __init__(self, name: str, options: PylonOptions) -> None:
         where = DeviceInfo(
             "", "", options.serial, driver="pylon", address=options.address, simulated=options.emulated
         )  # fmt: skip
-        super().__init__(name, where)
+        super().__init__(name, where, options, fewest_buffers=_FEWEST_BUFFERS)
         self._options = options
         self._device: Any = None
-        self._controls: SfncControls | None = None
         self._counter = FrameCounter()
         self._ticks_per_s: float | None = None
 
@@ -109,14 +105,7 @@ class PylonCamera(LibraryCamera):
             raise self._not_opened(error) from error
         features = PylonFeatures(self._device.GetNodeMap())
         self._ticks_per_s = _clock_of(features, self._device_class)
-        self._controls = SfncControls(
-            self.name,
-            features,
-            self._options,
-            buffered_frames=_FREE_RUN_BUFFERS,
-            hardware_timestamp=self._ticks_per_s is not None,
-        )
-        self._controls.prepare()
+        self._prepare(features, hardware_timestamp=self._ticks_per_s is not None)
         self._replay(features)
         return self._who(pylon, features), self._controls.capabilities(), self._controls.read()
 
@@ -195,16 +184,10 @@ class PylonCamera(LibraryCamera):
 
     # ------------------------------------------------------------ settings and frames
 
-    def _apply(self, wanted: CameraSettings) -> CameraSettings:
-        assert self._controls is not None, "made by _connect"
-        return self._controls.apply(wanted, self._settings)
-
     def _start(self, n_frames: int | None) -> None:
         """Grab one by one: every frame that was exposed is delivered, in order."""
         pylon = imported(self.name, "pypylon.pylon", "pylon")
-        free_run = self._settings.trigger is TriggerSource.FREE_RUN
-        count = _FREE_RUN_BUFFERS if free_run else max(_FEWEST_BUFFERS, (n_frames or 0) + 2)
-        self._device.MaxNumBuffer.SetValue(count)
+        self._device.MaxNumBuffer.SetValue(self._buffers_for(n_frames))
         self._counter.restart()
         self._device.StartGrabbing(pylon.GrabStrategy_OneByOne)
 
