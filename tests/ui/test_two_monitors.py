@@ -2,7 +2,7 @@
 
 import signal
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -63,10 +63,13 @@ def simulated(
     desktop: Desktop, station: Station, name: str, addresses: tuple[str, str], *more: str
 ) -> Iterator[Program]:
     program = simulate(desktop, name, addresses, *more)
-    program.wait_until_it_says("Stop with Ctrl")
-    station.add_rig(desktop.folder / f"{name}.yaml", name)
-    yield program
-    assert program.stop(signal.SIGINT) == 0, program.said
+    try:
+        program.wait_until_it_says("Stop with Ctrl")
+        station.add_rig(desktop.folder / f"{name}.yaml", name)
+        yield program
+    finally:  # the next test's cameras have the same addresses
+        status = program.stop(signal.SIGINT)
+    assert status == 0, program.said
 
 
 @pytest.fixture(scope="module")
@@ -95,17 +98,20 @@ class Window:
 
 @contextmanager
 def opened_window(desktop: Desktop, station: Station, playwright: Playwright) -> Iterator[Window]:
-    program, tools = station.open_page(desktop.folder / "kiosk")
-    browser = playwright.chromium.connect_over_cdp(tools)
-    page = next(p for p in browser.contexts[0].pages if "/projector" in p.url)
-    page.get_by_text("waiting for patterns").wait_for()
-    page.wait_for_function(
-        "([left, width, height]) => screenX === left && innerWidth === width && innerHeight === height",
-        arg=[SIZE[0], *SIZE],
-    )
-    yield Window(program, page)
-    browser.close()
-    program.stop()
+    with ExitStack() as closing_all:
+        program, tools = station.open_page(desktop.folder / "kiosk")
+        # A kiosk that is left over would open the next one's page, in a window of its own.
+        closing_all.callback(program.stop)
+        browser = playwright.chromium.connect_over_cdp(tools)
+        closing_all.callback(browser.close)
+        page = next(p for p in browser.contexts[0].pages if "/projector" in p.url)
+        # A scan that waits for the page shows its pattern at once, and so hides this text.
+        page.get_by_text("waiting for patterns").wait_for(state="attached")
+        page.wait_for_function(
+            "([left, width, height]) => screenX === left && innerWidth === width && innerHeight === height",
+            arg=[SIZE[0], *SIZE],
+        )
+        yield Window(program, page)
 
 
 @pytest.fixture
@@ -201,16 +207,18 @@ def test_every_pixel_of_the_second_monitor_is_as_asked(
 def test_a_camera_that_is_killed_in_mid_scan_and_comes_back(
     desktop: Desktop, station: Station, window: Window, shot: int
 ) -> None:
-    program = simulate(desktop, "frail", LATE_CAMERAS)
-    program.wait_until_it_says("Stop with Ctrl")
-    station.add_rig(desktop.folder / "frail.yaml", "frail")
-    scan = station.scan("frail", **BRIEF).start("fringe_capture")
-    scan.wait_for_shot(shot)
-    program.stop(signal.SIGKILL)
-    program = simulate(desktop, "frail", LATE_CAMERAS)
-    program.wait_until_it_says("Stop with Ctrl")
-    ends_or_goes_on(scan)
-    program.stop()
+    with ExitStack() as stopping:
+        program = simulate(desktop, "frail", LATE_CAMERAS)
+        stopping.callback(program.stop)
+        program.wait_until_it_says("Stop with Ctrl")
+        station.add_rig(desktop.folder / "frail.yaml", "frail")
+        scan = station.scan("frail", **BRIEF).start("fringe_capture")
+        scan.wait_for_shot(shot)
+        program.stop(signal.SIGKILL)
+        again = simulate(desktop, "frail", LATE_CAMERAS)
+        stopping.callback(again.stop)
+        again.wait_until_it_says("Stop with Ctrl")
+        ends_or_goes_on(scan)
 
 
 def test_a_pixel_format_that_the_cameras_lack_is_one_sentence(

@@ -279,9 +279,13 @@ class Station:
         )
         # DevTools let a test do what an operator might do to the window.
         program = self._desktop.start("kiosk", [*command, "--remote-debugging-port=0"])
-        wait_for(lambda: port.is_file() and "\n" in port.read_text(), "the browser's start")
-        tools = f"http://127.0.0.1:{port.read_text().split()[0]}"
-        wait_for(lambda: self._is_open(tools), "the projector page")
+        try:
+            wait_for(lambda: port.is_file() and "\n" in port.read_text(), "the browser's start")
+            tools = f"http://127.0.0.1:{port.read_text().split()[0]}"
+            wait_for(lambda: self._is_open(tools), "the projector page")
+        except BaseException:
+            program.stop()
+            raise
         return program, tools
 
     def _is_open(self, tools: str) -> bool:
