@@ -1,5 +1,6 @@
 """`unglare rigs template`, `show` and `calibration`: what stands in a rig file, and what stands beside it."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +11,7 @@ from backend.cli.output import answering, console, quiet_logging, table
 from backend.domain.errors import InvalidSettingError, NotFoundError
 
 if TYPE_CHECKING:
+    from backend.devices.calibration_entries import CalibrationEntry
     from backend.devices.rig_file import RigFile
     from backend.devices.rig_shelf import RigShelf
 
@@ -68,8 +70,8 @@ def calibration(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="What cv2.FileStorage wrote of a stereo calibration (one file or several), a capture.json, or the "
-            "calibration of another rig.",
+            help="What cv2.FileStorage wrote of a stereo calibration of two cameras, or of a camera and the projector (one "
+            "file or several); a capture.json; the calibration of another rig, or a part of one, e.g. its screen.",
         ),
     ],
     rig: Annotated[str, typer.Option(help="Name of a rig that is described by a file.")],
@@ -77,7 +79,8 @@ def calibration(
         str,
         typer.Option(
             metavar="FIRST,SECOND",
-            help="Which camera is OpenCV's first and which the second.  [default: as in the rig file]",
+            help="Which camera is OpenCV's first and which the second; the one that was calibrated with the projector."
+            "  [default: as in the rig file]",
             show_default=False,
         ),
     ] = "",
@@ -95,6 +98,14 @@ def calibration(
             show_default=False,
         ),
     ] = None,
+    projector_size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WIDTHxHEIGHT",
+            help="Size of the projector, where neither a file nor the rig's says it.",
+            show_default=False,
+        ),
+    ] = None,
     data: DataFolder = None,
     as_json: AsJson = False,
 ) -> None:
@@ -106,28 +117,49 @@ def calibration(
     with answering(as_json) as answer:
         shelf = open_shelf(data)
         file = RigFile.read(shelf.require(rig))
-        names = list(file.cameras)
-        chosen = [part.strip() for part in cameras.split(",")] if cameras else names
-        if sorted(chosen) != sorted(names):
-            raise InvalidSettingError(
-                f"--cameras {cameras} has to name the rig's cameras: {', '.join(names)}."
-            )
-        found = read_calibration(files, StereoHints(chosen, unit_mm, _pixels(size)))
+        hints = StereoHints(
+            _chosen(cameras, file),
+            unit_mm,
+            _pixels("--size", size),
+            _pixels("--projector-size", projector_size) or file.display_px,
+        )
+        known = shelf.read(rig).calibration
+        found = read_calibration(files, hints, known)
         entry = in_frame_of(found, file.reference_camera)
         path = shelf.keep_calibration(rig, entry, ", ".join(map(str, files)))
         answer.update(rig=rig, path=str(path), calibration=entry.model_dump(mode="json"))
         if not as_json:
-            _show_views(entry.model_dump())
+            _show_calibration(entry)
+            _say_lost(known, entry)
             console().print(f"kept in {path}; try it: unglare rigs check --rig {rig}")
 
 
-def _pixels(text: str | None) -> tuple[int, int] | None:
+def _chosen(cameras: str, file: "RigFile") -> list[str]:
+    names = list(file.cameras)
+    chosen = [part.strip() for part in cameras.split(",")] if cameras else names
+    if len(set(chosen)) != len(chosen) or not set(chosen) <= set(names):
+        raise InvalidSettingError(
+            f"--cameras {cameras} has to name the rig's cameras: {', '.join(names)}."
+        )
+    return chosen
+
+
+def _say_lost(before: "CalibrationEntry | None", now: "CalibrationEntry") -> None:
+    for name in ("projector", "screen", "mirror"):
+        if before is not None and getattr(before, name) and not getattr(now, name):
+            console().print(
+                f"The {name} that was calibrated before isn't kept: its place was said by cameras that are calibrated anew."
+                " Name its file, too."
+            )
+
+
+def _pixels(option: str, text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise InvalidSettingError(
-            f"--size {text} can't be read: write WIDTHxHEIGHT, e.g. 1280x1024."
+            f"{option} {text} can't be read: write WIDTHxHEIGHT, e.g. 1280x1024."
         )
     return int(width), int(height)
 
@@ -153,7 +185,7 @@ def _show(name: str, path: Path, beside: list[Path], file: "RigFile") -> None:
     )
     out.print(rows)
     if file.calibration is not None:
-        _show_views(file.calibration.model_dump())
+        _show_calibration(file.calibration)
     else:
         out.print("not calibrated: scans end with the phase, without points")
     for other in beside:
@@ -164,16 +196,23 @@ def _options(options: dict[str, Any] | None) -> str:
     return ", ".join(f"{key} {value}" for key, value in (options or {}).items())
 
 
-def _show_views(calibration: dict[str, Any]) -> None:
+def _show_calibration(calibration: "CalibrationEntry") -> None:
     rows = table("calibrated", ">size", ">focal length", ">principal point", ">from the reference")
-    views = {**calibration["cameras"], "projector": calibration["projector"]}
-    for name, view in views.items():
-        if view is None:
-            continue
-        K, t_mm = view["K"], view["t_mm"]
-        distance_mm = sum(value**2 for value in t_mm) ** 0.5
+    for name, view in calibration.views():
         rows.add_row(
-            name, f"{view['width_px']}x{view['height_px']} px", f"{K[0][0]:.1f} px",
-            f"{K[0][2]:.1f}, {K[1][2]:.1f} px", f"{distance_mm:.2f} mm",
+            name, f"{view.width_px}x{view.height_px} px", f"{view.K[0][0]:.1f} px",
+            f"{view.K[0][2]:.1f}, {view.K[1][2]:.1f} px", _distance(view.t_mm),
         )  # fmt: skip
+    screen = calibration.screen
+    if screen is not None:
+        pitch = f"pitch {screen.pixel_pitch_mm:g} mm" if screen.pixel_pitch_mm else ""
+        known = f"{len(screen.points)} points" if screen.points else pitch
+        size = "x".join(map(str, screen.size_px)) + " px" if screen.size_px else ""
+        rows.add_row("screen", size, known, "", _distance(screen.t_mm))
+    if calibration.mirror is not None:
+        rows.add_row("mirror", "", "", "", _distance(calibration.mirror.t_mm))
     console().print(rows)
+
+
+def _distance(t_mm: tuple[float, float, float]) -> str:
+    return f"{math.hypot(*t_mm):.2f} mm"

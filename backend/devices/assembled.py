@@ -58,6 +58,8 @@ class AssembledRig:
         What each camera shall not be used beyond.
     snap_exposures
         Whether exposures are to be whole frame periods of the projector.
+    calibrated_px
+        Width and height that cameras and `projector` were calibrated at, by name.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class AssembledRig:
         trigger_lines: Mapping[str, TriggerSource] | None = None,
         limits: Mapping[str, CameraLimits] | None = None,
         snap_exposures: bool = True,
+        calibrated_px: Mapping[str, tuple[int, int]] | None = None,
     ) -> None:
         self._name = name
         self._cameras = dict(cameras)
@@ -82,6 +85,7 @@ class AssembledRig:
         self._trigger_lines = dict(trigger_lines or {})
         self._limits = dict(limits or {})
         self._snap_exposures = snap_exposures
+        self._calibrated_px = dict(calibrated_px or {})
 
     @property
     def name(self) -> str:
@@ -133,6 +137,7 @@ class AssembledRig:
 
     def facts(self) -> RigFacts:
         """Return sizes and ranges as the devices tell them, noise as the rig's owner measured it."""
+        self._refuse_other_sizes()
         cameras = {name: self._camera_facts(name) for name in self._cameras}
         can = self._projector.capabilities
         # A pattern of a sequence is complete within the exposure, whatever that is: no grid is needed.
@@ -144,6 +149,18 @@ class AssembledRig:
     def calibration(self) -> RigCalibration | None:
         """Return the calibration that was handed in."""
         return self._calibration
+
+    def _refuse_other_sizes(self) -> None:
+        """Refuse a calibration of another size: points from it would look right and be wrong."""
+        sizes = {name: camera.capabilities.sensor_size for name, camera in self._cameras.items()}
+        sizes["projector"] = self._projector.capabilities.size
+        for name, calibrated in self._calibrated_px.items():
+            if sizes[name] != calibrated:
+                (width, height), (now_width, now_height) = calibrated, sizes[name]
+                raise RigConfigError(
+                    f"{name}: the calibration is for {width}x{height} px, the device has {now_width}x{now_height};"
+                    " calibrate it at the size in use, or use it at the size it was calibrated at"
+                )
 
     def _camera_facts(self, name: str) -> CameraFacts:
         can, sensor = self._cameras[name].capabilities, self._sensors[name]

@@ -10,8 +10,8 @@
 
 The first camera is the reference unless `reference: right` says otherwise. `trigger_line: Line1` says which line of a camera the projector's trigger output
 drives; `limits: {longest_exposure_ms: 500, largest_gain_db: 12}` what a camera shall not be used beyond. What a driver
-needs besides (`address` above) is its own matter: `unglare drivers NAME`. `calibration` is an entry (`CalibrationEntry`)
-or the name of a file that holds one.
+needs besides (`address` above) is its own matter: `unglare drivers NAME`. `calibration` is an entry
+(`backend/devices/calibration_entries.py`) or the name of a file that holds one.
 """
 
 import re
@@ -20,24 +20,29 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from backend.devices.assembled import AssembledRig, CameraLimits, SensorFacts
+from backend.devices.calibration_entries import CalibrationEntry
 from backend.devices.driver_loading import make_camera, make_projector
 from backend.devices.errors import RigConfigError
+from backend.devices.options import DisplaySize
 from backend.devices.pages import PageDesk
 from backend.devices.protocols import Projector, SequenceProjector, TriggerSource
-from backend.domain.rig import PinholeModel, Pose, RigCalibration
-from backend.numerics.pinhole import DISTORTION_SIZES
-
-_Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-
 
 _LINES = [s.value for s in TriggerSource if s.value.startswith("Line")]
 _IDENTITIES = ("address", "serial", "source", "device")
 """Options that drivers tell devices apart by."""
+_DISPLAY: TypeAdapter[tuple[int, int]] = TypeAdapter(DisplaySize)
 _CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,40}")
 
 
@@ -95,52 +100,6 @@ class ProjectorEntry(BaseModel):
     gamma: float = Field(1.0, gt=0.2, lt=5)
 
 
-class ViewEntry(_Part):
-    """How a calibrated device sees, and where it is."""
-
-    width_px: int = Field(gt=0)
-    height_px: int = Field(gt=0)
-    K: _Matrix
-    distortion: tuple[float, ...] = (0.0,) * 5
-    R: _Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    t_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @field_validator("R")
-    @classmethod
-    def _rotates(cls, value: _Matrix) -> _Matrix:
-        R = np.array(value)
-        if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
-            raise ValueError("it is no rotation: its rows have to be orthonormal and right-handed")
-        return value
-
-    @field_validator("distortion")
-    @classmethod
-    def _of_opencv(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if len(value) not in DISTORTION_SIZES:
-            known = ", ".join(map(str, DISTORTION_SIZES))
-            raise ValueError(f"it has {len(value)} coefficients, OpenCV's sets have {known}")
-        return value
-
-    @property
-    def model(self) -> PinholeModel:
-        """Intrinsics."""
-        return PinholeModel(
-            self.width_px, self.height_px, np.array(self.K), np.array(self.distortion)
-        )
-
-    @property
-    def device_from_world(self) -> Pose:
-        """Extrinsics."""
-        return Pose(np.array(self.R), np.array(self.t_mm))
-
-
-class CalibrationEntry(_Part):
-    """Where all devices are; the world is the reference camera's frame if its pose is left out."""
-
-    cameras: dict[str, ViewEntry]
-    projector: ViewEntry | None = None
-
-
 class RigFile(_Part):
     """A rig as its owner describes it."""
 
@@ -183,6 +142,14 @@ class RigFile(_Part):
         """Name of the projector page that shows its patterns; None where no page does."""
         options = self.projector.model_extra or {}
         return str(options.get("page", "projector")) if self.projector.driver == "page" else None
+
+    @property
+    def display_px(self) -> tuple[int, int] | None:
+        """Width and height of the projector, if its entry says it in the usual way."""
+        try:
+            return _DISPLAY.validate_python((self.projector.model_extra or {}).get("size"))
+        except ValidationError:
+            return None
 
     @field_validator("cameras")
     @classmethod
@@ -237,7 +204,7 @@ def assemble(name: str, file: RigFile, desk: PageDesk) -> AssembledRig:
         "projector", file.projector.driver, _options(file.projector), desk.for_rig(name)
     )
     _refuse_useless_wires(file, projector)
-    first = file.reference_camera
+    first, known = file.reference_camera, file.calibration
     return AssembledRig(
         name,
         {first: cameras[first], **cameras},
@@ -247,7 +214,8 @@ def assemble(name: str, file: RigFile, desk: PageDesk) -> AssembledRig:
             for camera, entry in file.cameras.items()
         },
         gamma=file.projector.gamma,
-        calibration=_calibration(file),
+        calibration=known.calibration(first) if known else None,
+        calibrated_px=known.sizes_px if known else None,
         trigger_lines={c: e.trigger_line for c, e in file.cameras.items() if e.trigger_line},
         limits={c: CameraLimits(**e.limits.model_dump()) for c, e in file.cameras.items()},
         snap_exposures=file.snap_exposures,
@@ -256,19 +224,6 @@ def assemble(name: str, file: RigFile, desk: PageDesk) -> AssembledRig:
 
 def _options(entry: CameraEntry | ProjectorEntry) -> Mapping[str, Any]:
     return dict(entry.model_extra or {})
-
-
-def _calibration(file: RigFile) -> RigCalibration | None:
-    known = file.calibration
-    if known is None:
-        return None
-    return RigCalibration(
-        cameras={name: view.model for name, view in known.cameras.items()},
-        camera_from_world={name: view.device_from_world for name, view in known.cameras.items()},
-        reference=file.reference_camera,
-        projector=known.projector.model if known.projector else None,
-        projector_from_world=known.projector.device_from_world if known.projector else None,
-    )
 
 
 def _refuse_useless_wires(file: RigFile, projector: Projector) -> None:

@@ -8,12 +8,13 @@ from pathlib import Path
 import yaml
 from pydantic import BaseModel, ConfigDict
 
+from backend.devices.calibration_entries import CalibrationEntry
 from backend.devices.errors import RigConfigError, RigNotFoundError
 from backend.devices.loading import available_rigs, open_rig
 from backend.devices.options import DisplaySize
 from backend.devices.pages import PageDesk
 from backend.devices.protocols import Rig
-from backend.devices.rig_file import CalibrationEntry, RigFile, assemble, read_yaml
+from backend.devices.rig_file import RigFile, assemble, read_yaml
 from backend.devices.whole_files import write_whole
 
 CALIBRATION_SUFFIX = ".calibration.yaml"

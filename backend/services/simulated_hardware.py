@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from backend.devices.calibration_entries import entry_of
 from backend.devices.peers.gige_camera import Wire
 from backend.devices.peers.monitor_display import MonitorDisplay, MonitorHistory
 from backend.devices.peers.simulated_cameras import Peer, PeerProcess, make_rig
@@ -15,7 +16,7 @@ from backend.devices.peers.simulated_light import Ended, LightSource
 from backend.devices.protocols import Rig
 from backend.devices.rig_file import RigFile
 from backend.domain.errors import InvalidSettingError, StartupError
-from backend.domain.rig import PinholeModel, Pose, RigCalibration
+from backend.domain.rig import RigCalibration
 
 _SIZE_OPTIONS = {"simulated": "projector_size", "sim-lcd": "screen_size"}
 _STEADY: dict[str, dict[str, Any]] = {"simulated": {"frame_period_ms": None}, "sim-lcd": {}}
@@ -170,31 +171,17 @@ def rig_file(rig: Rig, hardware: Hardware) -> dict[str, Any]:
         "cameras": cameras,
         "projector": {**light.entry, "gamma": gamma},
     }
-    if calibration is not None and calibration.projector is not None:
-        document["calibration"] = _calibration(calibration, projector=not wiring)
+    if calibration is not None:
+        document["calibration"] = _calibration(calibration, light.size, square=not wiring)
     RigFile.of(document, "of the simulated hardware")
     return document
 
 
-def _calibration(calibration: RigCalibration, *, projector: bool) -> dict[str, Any]:
+def _calibration(
+    calibration: RigCalibration, display_px: tuple[int, int], *, square: bool
+) -> dict[str, Any]:
     """Write where the devices are; a projector whose mirrors stand on their corners has no model here."""
-    written: dict[str, Any] = {
-        "cameras": {
-            name: _view(model, calibration.camera_from_world[name])
-            for name, model in calibration.cameras.items()
-        }
-    }
-    if projector and calibration.projector and calibration.projector_from_world:
-        written["projector"] = _view(calibration.projector, calibration.projector_from_world)
-    return written
-
-
-def _view(model: PinholeModel, device_from_world: Pose) -> dict[str, Any]:
-    return {
-        "width_px": model.width_px,
-        "height_px": model.height_px,
-        "K": model.K.tolist(),
-        "distortion": model.distortion.tolist(),
-        "R": device_from_world.R.tolist(),
-        "t_mm": device_from_world.t_mm.tolist(),
-    }
+    entry = entry_of(calibration, display_px)
+    if not square:
+        entry = entry.model_copy(update={"projector": None})
+    return entry.model_dump(mode="json", exclude_none=True)

@@ -10,9 +10,10 @@ import pytest
 import yaml
 
 from backend.cli.application import run
+from backend.devices.calibration_entries import CalibrationEntry
 from backend.devices.errors import RigConfigError
 from backend.devices.pages import PageDesk
-from backend.devices.rig_file import CalibrationEntry, RigFile
+from backend.devices.rig_file import RigFile
 from backend.devices.rig_shelf import RigShelf
 from backend.devices.rig_templates import TEMPLATES
 from backend.domain.errors import InvalidCalibrationError
@@ -89,6 +90,77 @@ def test_intrinsics_and_extrinsics_may_stand_in_two_files(tmp_path: Path) -> Non
     entry = read_calibration([inner, outer], StereoHints(("left", "right"), 1000.0, SIZE))
     np.testing.assert_allclose(entry.cameras["right"].t_mm, T_MM.ravel(), atol=1e-9)
     np.testing.assert_allclose(entry.cameras["right"].R, R, atol=1e-9)
+
+
+PROJECTORS = {
+    "scan3d-capture": {"cam_K": K, "cam_kc": DISTORTION, "proj_K": K, "proj_kc": DISTORTION, "R": R, "T": T_MM},
+    "SLStudio": {"Kc": K, "kc": DISTORTION, "Kp": K, "kp": DISTORTION, "Rp": R, "Tp": T_MM, "frameWidth": 1280, "frameHeight": 1024, "screenResX": 0, "screenResY": 0},
+    "procam-calibration": {"img_shape": (1024, 1280), "cam_int": K, "cam_dist": DISTORTION, "proj_int": K, "proj_dist": DISTORTION, "roration": R, "translation": T_MM},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("content", PROJECTORS.values(), ids=PROJECTORS)
+def test_a_projector_calibrated_with_a_camera_is_where_opencv_has_it(
+    tmp_path: Path, content: dict[str, Any]
+) -> None:
+    size = SIZE if "cam_K" in content else None
+    hints = StereoHints(("left",), size=size, projector_size=(912, 1140))
+    entry = read_calibration([stored(tmp_path / "s.yml", content)], hints)
+    assert entry.projector is not None
+    assert (entry.projector.width_px, entry.projector.height_px) == (912, 1140)
+    assert (entry.cameras["left"].width_px, entry.cameras["left"].height_px) == SIZE
+    as_camera = CalibrationEntry(cameras={"projector": entry.projector})
+    points_mm = np.random.default_rng(0).uniform((-100, -80, 550), (100, 80, 650), (20, 3))
+    expected, _ = cv2.projectPoints(points_mm, R, T_MM, K, DISTORTION)
+    np.testing.assert_allclose(projected(as_camera, "projector", points_mm), expected, atol=1e-6)
+
+
+def test_a_projector_is_added_to_two_cameras_by_the_one_that_saw_it(tmp_path: Path) -> None:
+    stereo = in_frame_of(read_calibration([stored(tmp_path / "s.yml", WHOLE)], HINTS), "left")
+    file = stored(tmp_path / "p.yml", PROJECTORS["scan3d-capture"])
+    hints = StereoHints(("right", "left"), projector_size=(64, 48))
+    both = read_calibration([file], hints, stereo)
+    assert both.cameras == stereo.cameras
+    assert both.projector is not None
+    np.testing.assert_allclose(both.projector.R, R @ R, atol=1e-9)
+    np.testing.assert_allclose(both.projector.t_mm, (R @ T_MM + T_MM).ravel(), atol=1e-9)
+    with pytest.raises(InvalidCalibrationError, match="projector's size is missing"):
+        read_calibration([file], StereoHints(("right",)), stereo)
+
+
+SCREEN = "screen: {width_px: 64, height_px: 48, pixel_pitch_mm: 0.5, R: [[-1, 0, 0], [0, 1, 0], [0, 0, -1]], t_mm: [0, -9, 400]}"
+
+
+def test_a_screen_is_added_to_a_camera(tmp_path: Path) -> None:
+    lone = stored(tmp_path / "camera.yml", {"camera_matrix": K, "distortion_coefficients": DISTORTION, "image_width": 1280, "image_height": 1024})  # fmt: skip
+    part = tmp_path / "screen.yaml"
+    part.write_text(SCREEN)
+    hints = StereoHints(("camera",))
+    entry = read_calibration([lone, part], hints)
+    assert read_calibration([part], hints, read_calibration([lone], hints)) == entry
+    assert entry.screen is not None
+    corners = dict(zip(map(tuple, entry.screen.model.shares), entry.screen.model.points_mm, strict=True))  # fmt: skip
+    np.testing.assert_allclose(corners[0.0, 1.0], (-16.0, 12.0, 0.0))
+    with pytest.raises(InvalidCalibrationError, match=r"no camera in .*screen\.yaml"):
+        read_calibration([part], hints)
+
+
+@pytest.mark.parametrize("frame", ["left", "right"])
+def test_screen_and_mirror_stay_where_they_are_seen(tmp_path: Path, frame: str) -> None:
+    stereo = read_calibration([stored(tmp_path / "s.yml", WHOLE)], HINTS)
+    held = {"R": R.tolist(), "t_mm": [1.0, 2.0, 500.0]}
+    screen = yaml.safe_load(SCREEN)["screen"]
+    entry = CalibrationEntry.model_validate({**stereo.model_dump(), "mirror": held, "screen": screen})  # fmt: skip
+    turned = in_frame_of(entry, frame)
+    assert turned.screen is not None
+    assert turned.mirror is not None
+    assert entry.screen is not None
+    for part, before in ((turned.screen, entry.screen), (turned.mirror, entry.mirror)):
+        assert before is not None
+        middle_mm = -np.array(before.R).T @ before.t_mm
+        seen = entry.cameras[frame]
+        expected = np.array(seen.R) @ middle_mm + seen.t_mm
+        np.testing.assert_allclose(-np.array(part.R).T @ part.t_mm, expected, atol=1e-9)
 
 
 def test_the_second_camera_may_be_the_reference(tmp_path: Path) -> None:

@@ -25,6 +25,9 @@ cameras:
 projector: {driver: page, size: 1280x800, refresh_hz: 60, settle_ms: 17, gamma: 2.2}
 """
 VIEW = "{width_px: 64, height_px: 48, K: [[60, 0, 32], [0, 60, 24], [0, 0, 1]]%s}"
+UNIT = "[[1, 0, 0], [0, 1, 0], [0, 0, 1]]"
+CALIBRATED = f"{BENCH}calibration:\n  cameras: {{left: {VIEW % ''}, right: {VIEW}}}\n"
+APART = CALIBRATED % ", t_mm: [9, 0, 0]"
 
 
 @pytest.fixture
@@ -116,6 +119,12 @@ def test_options_of_a_described_rig_are_refused(tmp_path: Path, shelf: RigShelf)
         (BENCH.replace("page,", "beamer,"), "projector: there is no driver 'beamer'; choose page"),
         (BENCH + "calibration: {cameras: {left: " + VIEW % "" + "}}", "calibration is for cameras \\['left'\\], the rig has"),
         (BENCH + "calibration: {cameras: {left: " + VIEW % ", R: [[2, 0, 0], [0, 1, 0], [0, 0, 1]]" + "}}", "no rotation"),
+        (CALIBRATED % "", "left and right stand at the same place, so there would be no depth"),
+        (f"{APART}  screen: {{R: {UNIT}, t_mm: [0, 0, 1]}}", "calibration.screen: give either pixel_pitch_mm"),
+        (f"{APART}  screen: {{R: {UNIT}, t_mm: [0, 0, 1], pixel_pitch_mm: 0.1}}", "with pixel_pitch_mm it needs width_px and height_px"),
+        (f"{APART}  screen: {{R: {UNIT}, t_mm: [0, 0, 1], pixel_pitch_mm: 0.00027}}", "pixel_pitch_mm can't be 0.00027: input should be greater"),
+        (f"{APART}  screen: {{R: {UNIT}, pixel_pitch_mm: 0.27}}", "calibration.screen.t_mm is missing; add it"),
+        (f"{APART}  screen: {{R: {UNIT}, t_mm: [0, 0, 1], points: [[0, 0, 1, 1, 0], [0, 1, 1, 1, 0], [0, 0.5, 3, 3, 3]]}}", "lie on one line of the pattern"),
         (BENCH.replace("192.0.2.3", "192.0.2.2"), r"left and right are the same device \(address 192.0.2.2\): give each its own"),
         (BENCH.replace("right:", "left:"), "isn't YAML \\('left' stands twice in the entry that begins in line 4"),
         (BENCH + "reference: middle", "reference 'middle' is none of its cameras: choose left, right"),
@@ -210,6 +219,16 @@ def test_another_depth_than_the_cameras_is_refused() -> None:
         _twelve_bits(8) as rig,
         pytest.raises(RigConfigError, match="left: the camera delivers Mono12, 12 bits"),
     ):
+        rig.facts()
+
+
+@pytest.mark.parametrize("device", ["right", "projector"])
+def test_a_calibration_at_another_size_is_refused(device: str) -> None:
+    simulated = create_rig({"scene": "plane", "size": "64x48", "projector_size": "80x48"})
+    sensors = dict.fromkeys(simulated.cameras, SensorFacts())
+    sizes = {"left": (64, 48), "right": (64, 48), "projector": (80, 48), device: (60, 40)}
+    rig = AssembledRig("bench", simulated.cameras, simulated.projector, sensors=sensors, calibrated_px=sizes)  # fmt: skip
+    with rig, pytest.raises(RigConfigError, match=f"{device}: the calibration is for 60x40 px"):
         rig.facts()
 
 

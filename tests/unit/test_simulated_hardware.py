@@ -14,6 +14,7 @@ from backend.devices.peers.simulated_cameras import make_rig
 from backend.devices.peers.simulated_light import Ended, Fire
 from backend.devices.rig_file import RigFile, assemble
 from backend.domain.errors import InvalidSettingError, StartupError
+from backend.numerics.screen_surface import screen_surface
 from backend.services.simulated_hardware import Hardware, SimulatedHardware, rig_file
 
 
@@ -79,10 +80,26 @@ def test_a_light_that_triggers_is_wired_and_has_no_model_of_square_pixels() -> N
     assert "projector" not in document["calibration"]
 
 
-def test_a_screen_and_a_mirror_are_simulated_too() -> None:
-    options = {"scene": "mirror-flat", "size": "160x120"}
-    document = written(hardware(rig="sim-lcd", options=options, addresses=("127.0.0.2",)))
+@pytest.mark.parametrize("bow_mm", [0.0, 8.0])
+def test_a_screen_and_a_mirror_are_simulated_too(bow_mm: float) -> None:
+    options = {"scene": "mirror-flat", "size": "160x120", "screen_bow_mm": bow_mm}
+    wanted = hardware(rig="sim-lcd", options=options, addresses=("127.0.0.2",))
+    document = written(wanted)
     assert list(document["cameras"]) == ["camera"]
+    assert ("pixel_pitch_mm" in document["calibration"]["screen"]) == (bow_mm == 0)
+
+    kept = assemble("lab", RigFile.of(document, "lab"), PageDesk()).calibration()
+    exact = make_rig("sim-lcd", wanted.rig_options, None).calibration()
+    assert kept is not None
+    assert exact is not None
+    for name in ("screen_from_world", "mirror_from_world"):
+        np.testing.assert_array_equal(getattr(kept, name).R, getattr(exact, name).R)
+        np.testing.assert_array_equal(getattr(kept, name).t_mm, getattr(exact, name).t_mm)
+    assert kept.screen is not None
+    assert exact.screen is not None
+    at = np.random.default_rng(0).uniform(0, 1, (50, 2))
+    theirs, ours = (screen_surface(s.shares, s.points_mm) for s in (exact.screen, kept.screen))
+    np.testing.assert_allclose(ours.points(at), theirs.points(at), atol=1e-9)
 
 
 def test_another_size_than_the_lights_is_refused() -> None:
