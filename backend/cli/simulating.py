@@ -3,7 +3,7 @@
 import signal
 import tempfile
 import threading
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -82,7 +82,7 @@ def simulate_hardware(
     """
     from backend.devices.loading import DEFAULT_METHOD, rig_for
     from backend.devices.peers.simulated_light import LightcrafterLight
-    from backend.domain.errors import InvalidSettingError
+    from backend.domain.errors import CancelledError, InvalidSettingError
     from backend.services.simulated_hardware import Hardware, SimulatedHardware
 
     quiet_logging()
@@ -106,7 +106,10 @@ def simulate_hardware(
         seed=seed or 0,
     )
     ended = _told_to_end()
-    with closing(SimulatedHardware(hardware)) as simulated:
+    with (
+        suppress(CancelledError),  # Ctrl+C while they start ends them as it does later
+        closing(SimulatedHardware(hardware, ended.is_set)) as simulated,
+    ):
         if write_rig is not None:
             simulated.write_rig(write_rig)
             typer.echo(f"The rig file is {write_rig}; keep it: unglare rigs add {write_rig}")

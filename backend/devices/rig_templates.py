@@ -64,5 +64,40 @@ projector:
   gamma: 2.2
 {_ENTRIES}"""
 
-TEMPLATES = {"stereo-page": STEREO_PAGE, "lightcrafter": LIGHTCRAFTER, "webcam": WEBCAM}
+MIRROR_PAGE = f"""\
+# One camera that sees this computer's second monitor in a mirror: unglare scan --rig NAME --method fringe-reflection
+title: Mirrors
+cameras:
+  camera:
+    driver: aravis
+    address: 192.168.10.2         # <- REPLACE
+{_SENSOR}\
+projector:
+  driver: page                    # the monitor is the screen: a browser window on it, unglare projector
+  size: 1920x1080                 # <- REPLACE: pixels of that monitor; patterns are never scaled
+snap_exposures: true              # whole frames of the monitor; false where its backlight is steady
+# Without a calibration scans end with the places on the screen. Poses are x_device = R x_world + t_mm, the world is the
+# camera's frame: +X right, +Y down, +Z forward, mm.
+calibration:
+  cameras:
+    camera:                       # <- REPLACE: as OpenCV calibrates it, at the size of its pictures
+      width_px: 1280
+      height_px: 1024
+      K: [[3712, 0, 640], [0, 3712, 512], [0, 0, 1]]
+      distortion: [0, 0, 0, 0, 0]
+  screen:                         # <- REPLACE: +X right and +Y down as its viewer sees it, +Z away from him; origin in its middle
+    width_px: 1920
+    height_px: 1080
+    pixel_pitch_mm: 0.2767        # from its data sheet; of a bent one `points: [[x, y in 0..1 of the pattern, x, y, z in mm], ...]`
+    R: [[-1, 0, 0], [0, 0.866025, 0.5], [0, 0.5, -0.866025]]
+    t_mm: [0, -100, 200]          # where the camera is in the screen's frame
+  # mirror: {{R: [[1, 0, 0], [0, -1, 0], [0, 0, -1]], t_mm: [0, 0, 700]}}  # if it always lies there; else its outline tells
+"""
+
+TEMPLATES = {
+    "stereo-page": STEREO_PAGE,
+    "mirror-page": MIRROR_PAGE,
+    "lightcrafter": LIGHTCRAFTER,
+    "webcam": WEBCAM,
+}
 """Text by name."""

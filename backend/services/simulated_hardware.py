@@ -1,6 +1,6 @@
 """Simulated hardware: cameras on the network, what lights the scene before them, and their rig file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,15 +60,25 @@ class Hardware:
 class SimulatedHardware:
     """Cameras on the network, each in a process; `run` lights what they see.
 
+    Parameters
+    ----------
+    hardware
+        What is to be simulated.
+    ended
+        Asked while the cameras start, which may take minutes: whether nobody wants them any more.
+
     Raises
     ------
     StartupError
         If there aren't as many addresses as cameras, or one of them is taken.
+    CancelledError
+        If `ended` says so.
     UnglareError
         If an option can't be used.
     """
 
-    def __init__(self, hardware: Hardware) -> None:
+    def __init__(self, hardware: Hardware, ended: Callable[[], bool] = lambda: False) -> None:
+        self._ended = ended
         self._hardware = hardware
         with ExitStack() as stack:
             self._history = MonitorHistory(*hardware.light.size)
@@ -93,7 +103,7 @@ class SimulatedHardware:
         for process in peers:
             stack.callback(process.tell_end)  # all of them end at once, then they are waited for
         for process in peers:
-            process.wait_until_ready()
+            process.wait_until_ready(self._ended)
         return peers
 
     def write_rig(self, path: Path) -> None:

@@ -92,7 +92,7 @@ def test_intrinsics_and_extrinsics_may_stand_in_two_files(tmp_path: Path) -> Non
     np.testing.assert_allclose(entry.cameras["right"].R, R, atol=1e-9)
 
 
-PROJECTORS = {
+PROJECTORS: dict[str, dict[str, Any]] = {
     "scan3d-capture": {"cam_K": K, "cam_kc": DISTORTION, "proj_K": K, "proj_kc": DISTORTION, "R": R, "T": T_MM},
     "SLStudio": {"Kc": K, "kc": DISTORTION, "Kp": K, "kp": DISTORTION, "Rp": R, "Tp": T_MM, "frameWidth": 1280, "frameHeight": 1024, "screenResX": 0, "screenResY": 0},
     "procam-calibration": {"img_shape": (1024, 1280), "cam_int": K, "cam_dist": DISTORTION, "proj_int": K, "proj_dist": DISTORTION, "roration": R, "translation": T_MM},
@@ -266,7 +266,7 @@ def test_templates_are_rig_files(kind: str, capsys: pytest.CaptureFixture[str]) 
     assert run(["rigs", "template", kind]) == 0
     text = capsys.readouterr().out
     assert "REPLACE" in text
-    for comment in ("limits", "gamma", "snap_exposures", "exposure_us"):
+    for comment in ("limits", "gamma", "snap_exposures", "exposure_us", "mirror"):
         text = text.replace(f"# {comment}: ", f"{comment}: ")
     assert RigFile.of(yaml.safe_load(text), kind).title
 

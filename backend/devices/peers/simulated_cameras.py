@@ -4,7 +4,8 @@ import errno
 import logging
 import multiprocessing
 import signal
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -24,13 +25,14 @@ from backend.devices.sim import (
 )
 from backend.devices.sim.camera import SimulatedCamera
 from backend.devices.sim.renderer import Light
-from backend.domain.errors import StartupError, UnglareError
+from backend.domain.errors import CancelledError, StartupError, UnglareError
 
 log = logging.getLogger(__name__)
 
 _START_S = 300.0
 """So long a large scene may take to be cast."""
 _END_S = 5.0
+_LOOK_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -73,17 +75,23 @@ class PeerProcess:
         self._process.start()
         theirs.close()
 
-    def wait_until_ready(self) -> None:
-        """Wait until the camera answers.
+    def wait_until_ready(self, ended: Callable[[], bool] = lambda: False) -> None:
+        """Wait until the camera answers, or until `ended` says that nobody wants it any more.
 
         Raises
         ------
         StartupError
             If it can't: the address is taken, or the scene can't be made.
+        CancelledError
+            If `ended` says so.
         """
         problem = f"it isn't ready after {_START_S:g} s; choose a smaller size"
+        deadline_s = time.monotonic() + _START_S
         try:
-            if self._told.poll(_START_S):
+            while not (there := self._told.poll(_LOOK_S)) and time.monotonic() < deadline_s:
+                if ended():
+                    raise CancelledError("Ended before the cameras were ready.")
+            if there:
                 problem = self._told.recv()
         except EOFError:
             problem = "its process ended at once; look at what it wrote"
