@@ -26,7 +26,7 @@ div:has(> i.ug-edited) + div .mantine-Input-input { border-left: 3px solid var(-
 div:has(> i.ug-edited) + div p { color: #f0c274 !important; }
 div:has(> i.ug-wrong) + div .mantine-Input-input { border-color: #e25555 !important; }
 .ug-setting-note { font-size: 11px; color: var(--ug-amber); margin: -4px 10px 6px calc(42% + 6px); line-height: 1.3; }
-.ug-setting-note.ug-examples { color: var(--ug-dim); } .ug-setting-note .ug-failure { color: #ff8a8a; }
+.ug-setting-note.ug-between { display: flex; justify-content: space-between; margin-top: 0; min-height: 15px; } .ug-setting-note.ug-examples { color: var(--ug-dim); } .ug-setting-note .ug-failure { color: #ff8a8a; }
 
 /* rows of buttons */
 div:has(> i.ug-primary) + div button { height: 38px !important; font-size: 15px; font-weight: 600; }

@@ -191,7 +191,7 @@ class RigDeskPanel:
             return
         try:
             live = self._desk.api.set_live(rig, settings)
-            self._light.put(live.settings)  # snapped: what was typed may stand there still
+            self._light.answered(settings, live.settings)  # snapped: what was typed may stand there
             self._draw_live(live)
         except ApiError:
             if state is not None:

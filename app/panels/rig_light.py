@@ -8,6 +8,7 @@ import viser
 
 from app import markup
 from app.desk import Desk
+from app.exposing import advised
 from app.numbers import number
 from backend.contract.rigs import Limits, LiveSettings, LiveView, RigLink, RigState
 
@@ -16,6 +17,10 @@ _TYPING_S = 0.5
 _STEP = 1.08
 """From one stop of the exposure's slider to the next, where it isn't a whole period."""
 _GRAY = "gray"
+_MOST_STEPS = 8
+"""So many exposures are tried before the search for one is given up: the scene changes."""
+_SAME = 0.05
+"""Exposures that differ by less are the same: cameras round them."""
 
 
 class Page(Protocol):
@@ -34,17 +39,23 @@ class LightPanel:
     def __init__(self, gui: viser.GuiApi, desk: Desk, page: Page) -> None:
         self._desk, self._page = desk, page
         self._state: RigState | None = None
+        self._lock = threading.RLock()
         self._settings = LiveSettings()
+        """Those on the screen: what was asked for last, else what is in force."""
+        self._wanted: LiveSettings | None = None
+        """Asked for and not answered yet: what is in force meanwhile is older."""
+        self._typed: dict[str, Any] = {}
         self._grid: tuple[float, ...] = (1.0,)
         self._waiting: threading.Timer | None = None
-        self._touched_at: float = 0.0
+        self._steps_left = 0
+        """Of the search for an exposure; 0: none is searched for."""
         self._patterns = gui.add_html("")
         self._level: Any = gui.add_slider("Gray level", 0, 255, 1, 128, visible=False)
         self._exposure: Any = gui.add_number("Exposure [ms]", 20.0, min=0.0, step=0.01)
         gui.add_html(markup.marker("ug-bare"))
         self._stops: Any = gui.add_slider("", 0, 1, 1, 0)
-        self._gain: Any = gui.add_slider("Gain [dB]", 0.0, 1.0, 0.1, 0.0)
         self._period = gui.add_html("")
+        self._gain: Any = gui.add_slider("Gain [dB]", 0.0, 1.0, 0.1, 0.0)
         gui.add_html(markup.marker("ug-row3 ug-boxes"))
         self._live: Any = gui.add_checkbox(
             "Live", True, hint="Take pictures as long as this page is open"
@@ -69,11 +80,16 @@ class LightPanel:
 
     def show(self, state: RigState, *, anew: bool = False) -> None:
         """Show this state; `anew` writes the controls even where nothing has changed."""
-        old, self._state = self._state, state
-        if old is None or anew or _reach(old) != _reach(state):
-            self._show_reach(state)
-        if old is None or anew or old.name != state.name:
-            self.put(state.live)
+        with self._lock:
+            old, self._state = self._state, state
+            is_other = old is None or anew or old.name != state.name
+            if is_other or (old is not None and _reach(old) != _reach(state)):
+                self._show_reach(state)
+            if is_other:
+                self._forget_wishes()
+                self.put(state.live)
+            else:
+                self._draw_period()
         is_free = state.owner is None and state.link is RigLink.OPEN
         for control in self._controls():
             control.disabled = not is_free
@@ -83,10 +99,25 @@ class LightPanel:
         self._draw_patterns()
 
     def show_live(self, live: LiveView) -> None:
-        """Show the settings in force, unless something is typed just now."""
-        if live.settings != self._settings and self._waiting is None:
-            self.put(live.settings)
-            self._draw_patterns()
+        """Show the settings in force, unless something is typed or asked for just now."""
+        with self._lock:
+            if self._waiting is not None or self._wanted is not None:
+                return
+            if live.settings != self._settings:
+                self.put(live.settings)
+                self._draw_patterns()
+            if self._steps_left:
+                self._search(live)
+
+    def answered(self, asked: LiveSettings, in_force: LiveSettings) -> None:
+        """Show what came of a change, unless another one was asked for since."""
+        with self._lock:
+            if self._wanted not in (None, asked):
+                return
+            self._wanted = None
+            if self._waiting is None:
+                self.put(in_force)
+                self._draw_patterns()
 
     # ---- drawing
 
@@ -122,22 +153,37 @@ class LightPanel:
         ):  # fmt: skip
             if control.value != value:
                 control.value = value
+        self._show_what_follows(settings)
+
+    def _show_what_follows(self, settings: LiveSettings) -> None:
         self._level.visible = self._operates and settings.pattern == _GRAY
-        self._period.content = self._period_html(settings)
+        self._draw_period()
 
     def _stop_of(self, exposure_ms: float) -> int:
         return int(np.argmin(np.abs(np.log(np.array(self._grid) / max(exposure_ms, 1e-6)))))
 
+    def _draw_period(self) -> None:
+        content = self._period_html(self._settings)
+        if self._period.content != content:
+            self._period.content = content
+
     def _period_html(self, settings: LiveSettings) -> str:
-        period_ms = self._state.period_ms if self._state else None
-        if period_ms is None:
+        state = self._state
+        if state is None or state.exposure_ms is None:
             return ""
-        periods = settings.exposure_ms / period_ms
-        is_whole = abs(periods - round(periods)) < 1e-3
-        count = number(round(periods) if is_whole else round(periods, 2))
-        words = f"{count} {'period' if count == '1' else 'periods'} of {number(period_ms)} ms"
-        css = "ug-setting-note ug-examples" if is_whole else "ug-setting-note"
-        return markup.div(css, markup.esc(words if is_whole else f"{words}: may flicker"))
+        words, doubtful = _in_periods(settings.exposure_ms, state.period_ms)
+        reach = f"{number(state.exposure_ms.min)} to {number(state.exposure_ms.max)} ms"
+        css = "ug-setting-note" if doubtful else "ug-setting-note ug-examples"
+        told = markup.span("", markup.esc(words), title=f"The cameras can do {reach}")
+        return markup.div(f"{css} ug-between", told + self._search_link(state))
+
+    def _search_link(self, state: RigState) -> str:
+        if not self._operates or state.owner is not None or state.link is not RigLink.OPEN:
+            return ""
+        if self._steps_left:
+            return self._desk.clicks.label("search", self._give_up, "searching … stop", "ug-link")
+        hint = "Search the exposure at which the brightest pixels stay just below saturation"
+        return self._desk.clicks.label("search", self._begin_search, "auto", "ug-link", hint)
 
     def _draw_patterns(self) -> None:
         state = self._state
@@ -182,21 +228,69 @@ class LightPanel:
         control.on_update(changed)
 
     def _change(self, **changes: Any) -> None:
-        """Send a change at once; the newest of several waiting ones counts."""
-        self._stop_waiting()
-        wanted = self._settings.model_copy(update=changes)
-        if "snap" in changes:
-            self._settings, old = wanted, self._settings
+        """Show a change and send it at once, together with what is typed and what isn't answered yet."""
+        with self._lock:
+            self._stop_waiting()
+            if not {"snap", "pattern", "level"}.issuperset(changes):
+                self._steps_left = 0  # whoever sets the light himself doesn't want it searched
+            wanted = self._settings.model_copy(update={**self._typed, **changes})
+            self._typed = {}
+            self._ask(wanted)
+
+    def _ask(self, wanted: LiveSettings) -> None:
+        is_other_grid = wanted.snap != self._settings.snap
+        self._settings = self._wanted = wanted
+        if is_other_grid:
             self._show_grid()
-            self._settings = old
+        self._show_what_follows(wanted)
+        self._draw_patterns()
         self._page.set_live(wanted)
 
     def _change_later(self, **changes: Any) -> None:
         """Send a change when nothing more is typed."""
+        with self._lock:
+            self._stop_waiting()
+            self._typed |= changes
+            self._waiting = threading.Timer(_TYPING_S, lambda: self._change(**self._typed))
+            self._waiting.daemon = True
+            self._waiting.start()
+
+    def _forget_wishes(self) -> None:
         self._stop_waiting()
-        self._waiting = threading.Timer(_TYPING_S, lambda: self._change(**changes))
-        self._waiting.daemon = True
-        self._waiting.start()
+        self._wanted, self._typed, self._steps_left = None, {}, 0
+
+    # ---- searching an exposure
+
+    def _begin_search(self) -> None:
+        with self._lock:
+            self._steps_left = _MOST_STEPS
+            self._draw_period()
+
+    def _give_up(self) -> None:
+        with self._lock:
+            self._steps_left = 0
+            self._draw_period()
+
+    def _search(self, live: LiveView) -> None:
+        """Take the next step as soon as all cameras show the present exposure."""
+        now_ms = live.settings.exposure_ms
+        state = self._state
+        shown = [c.exposure_ms or now_ms for c in live.cameras]
+        if (
+            state is None
+            or state.exposure_ms is None
+            or not shown
+            or any(abs(ms / now_ms - 1) > _SAME for ms in shown)
+        ):
+            return
+        advice = advised([c.histogram for c in live.cameras], now_ms, self._grid)
+        self._steps_left -= 1
+        if abs(advice.exposure_ms / now_ms - 1) > _SAME and self._steps_left:
+            self._ask(self._settings.model_copy(update={"exposure_ms": advice.exposure_ms}))
+            return
+        self._give_up()
+        if advice.remark:
+            self._desk.notify("Exposure", advice.remark, colour="orange")
 
     def _stop_waiting(self) -> None:
         waiting, self._waiting = self._waiting, None
@@ -225,6 +319,17 @@ def stops_ms(limits: Limits, period_ms: float | None) -> tuple[float, ...]:
     ):
         periods.append(more)
     return tuple(k * period_ms for k in periods)
+
+
+def _in_periods(exposure_ms: float, period_ms: float | None) -> tuple[str, bool]:
+    """Say how many periods of the projector an exposure is, and whether that is doubtful."""
+    if period_ms is None:
+        return "", False
+    periods = exposure_ms / period_ms
+    is_whole = abs(periods - round(periods)) < 1e-3
+    count = number(round(periods) if is_whole else round(periods, 2))
+    words = f"{count} {'period' if count == '1' else 'periods'} of {number(period_ms)} ms"
+    return (words, False) if is_whole else (f"{words}: may flicker", True)
 
 
 def _reach(state: RigState) -> tuple[Any, ...]:
