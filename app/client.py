@@ -210,9 +210,9 @@ class ApiClient:
         """End live pictures now."""
         return self._send("DELETE", f"/api/rigs/{quote(rig)}/live", None, _LIVE)
 
-    def try_rig(self, rig: str) -> RigState:
-        """Begin a trial of a rig."""
-        return self._send("POST", f"/api/rigs/{quote(rig)}/trial", None, _RIG_STATE)
+    def check_rig(self, rig: str) -> RigState:
+        """Begin to check a rig."""
+        return self._send("POST", f"/api/rigs/{quote(rig)}/check", None, _RIG_STATE)
 
     def start_latency(self, rig: str, request: StartLatency) -> RigState:
         """Begin to measure the latency of a rig's projector."""
@@ -223,7 +223,7 @@ class ApiClient:
         return self._get(f"/api/rigs/{quote(rig)}/latency", _LATENCY)
 
     def cancel_work(self, rig: str) -> RigState:
-        """Have the trial or latency calibration ended that runs."""
+        """Have the check or latency calibration ended that runs."""
         return self._send("DELETE", f"/api/rigs/{quote(rig)}/work", None, _RIG_STATE)
 
     def discover(self, request: DiscoverCameras) -> Discovery:

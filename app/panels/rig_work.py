@@ -1,4 +1,4 @@
-"""Work at a rig: its trial, and the latency calibration of its projector with its curve."""
+"""Work at a rig: its check, and the latency calibration of its projector with its curve."""
 
 from typing import Any
 
@@ -39,19 +39,19 @@ class RigWorkPanel:
 
     def _add_buttons(self, gui: viser.GuiApi) -> None:
         gui.add_html(markup.marker("ug-row2"))
-        attempt = gui.add_button(
-            "Try", color="gray", icon=viser.Icon.CHECKLIST, hint="A white and a black frame of each camera, and what looks wrong"
+        check = gui.add_button(
+            "Check", color="gray", icon=viser.Icon.CHECKLIST, hint="A white and a black frame of each camera, and what looks wrong"
         )  # fmt: skip
         latency = gui.add_button(
             "Latency", color="gray", icon=viser.Icon.HOURGLASS, hint="Measure how long after its acknowledgement the projector shows a pattern"
         )  # fmt: skip
-        self._buttons = [attempt, latency]
+        self._buttons = [check, latency]
         api = self._desk.api
 
-        @attempt.on_click
+        @check.on_click
         async def _(_: viser.GuiEvent[Any]) -> None:
             if (rig := self._page.rig) is not None:
-                self._page.do(lambda: api.try_rig(rig))
+                self._page.do(lambda: api.check_rig(rig))
 
         @latency.on_click
         async def _(_: viser.GuiEvent[Any]) -> None:
@@ -66,7 +66,7 @@ class RigWorkPanel:
             return markup.div("ug-why", markup.esc(f"{title}: {work.error}"))
         if work.status is WorkStatus.CANCELLED:
             return markup.div("ug-text ug-doc", markup.esc(f"{title}: cancelled."))
-        return trial_html(work) if work.lines else ""
+        return check_html(work) if work.lines else ""
 
     def _running(self, title: str, work: RigWork) -> str:
         percent = round(100 * work.progress)
@@ -87,11 +87,11 @@ class RigWorkPanel:
             self._page.do(lambda: self._desk.api.cancel_work(rig))
 
 
-def trial_html(work: RigWork) -> str:
-    """Say what a trial found."""
+def check_html(work: RigWork) -> str:
+    """Say what a check found."""
     findings = "".join(_finding("warning", "!", text) for text in work.problems)
     if not work.problems:
-        findings = _finding("ok", "✓", "The trial found nothing wrong.")
+        findings = _finding("ok", "✓", "The check found nothing wrong.")
     lines = "".join(markup.div("ug-note", markup.esc(line)) for line in work.lines)
     return markup.div("ug-findings", findings + lines)
 

@@ -70,12 +70,12 @@ def words_html(found: LatencyView) -> str:
         for colour, text in ((_UP, "black to white"), (_DOWN, "white to black"))
     )
     when = found.measured.astimezone()
-    fate = "kept for this rig" if found.kept else found.note
+    fate = " ".join(filter(None, ("Kept for this rig." if found.kept else "", found.note)))
     rows = [
         ("Settle time", f"{number(found.settle_ms, 3)} ms"),
         ("Measured", f"{when.day} {when:%b %Y, %H:%M} at {number(found.refresh_hz, 4)} Hz"),
     ]
-    note = markup.div("ug-text ug-doc", markup.esc(fate[:1].upper() + fate[1:]))
+    note = markup.div("ug-text ug-doc", markup.esc(fate))
     return markup.div("ug-curves", keys) + markup.facts(rows) + note
 
 

@@ -18,7 +18,6 @@ from backend.contract.rigs import (
     LatencyView,
     LiveSettings,
     LiveView,
-    RigCheck,
     RigOffer,
     RigState,
     RigView,
@@ -40,14 +39,12 @@ def rigs(services: Uses) -> tuple[RigOffer, ...]:
 
 @router.post("/rigs/{rig}/view")
 def view_rig(rig: RigName, services: Uses, options: RigOptions = {}) -> RigView:  # noqa: B006  FastAPI copies it
-    """Tell the devices of a rig with these options; opens it."""
+    """Tell sizes, ranges and calibration of a rig as a scan with these options would have them.
+
+    Answers at once where they are known. Else the rig is opened for that, which may take as long as its devices take:
+    409 if somebody captures with other options, or if four others wait for it already.
+    """
     return services.rig(rig, options)
-
-
-@router.post("/rigs/{rig}/check")
-def check_rig(rig: RigName, services: Uses, options: RigOptions = {}) -> RigCheck:  # noqa: B006  FastAPI copies it
-    """Try a rig: open it, take a picture, say what was found."""
-    return services.check_rig(rig, options)
 
 
 @router.get(
@@ -87,7 +84,10 @@ def rig_state(rig: RigName, services: Uses) -> RigState:
 
 @router.post("/rigs/{rig}/connect", status_code=202)
 def connect_rig(rig: RigName, services: Uses, options: RigOptions = {}) -> RigState:  # noqa: B006  FastAPI copies it
-    """Have a rig opened in the background; one that is open stays as it is, whatever its options."""
+    """Have a rig opened in the background; one that is open stays as it is, whatever its options.
+
+    404 where no rig has this name; `link` and `failure` of the rig's state tell the rest.
+    """
     return services.rig_desk.connect(rig, options)
 
 
@@ -130,10 +130,21 @@ def end_live(rig: RigName, services: Uses) -> LiveView:
     return services.rig_desk.rest(rig)
 
 
-@router.post("/rigs/{rig}/trial", status_code=202)
-def try_rig(rig: RigName, services: Uses, who: Who) -> RigState:
-    """Begin to try a rig: a white and a black frame of each camera, and what looks wrong. `work` tells the result."""
-    return services.rig_desk.start_trial(rig, who.user)
+@router.post("/rigs/{rig}/check", status_code=202)
+def check_rig(
+    rig: RigName,
+    services: Uses,
+    who: Who,
+    options: Annotated[
+        dict[str, Any] | None,
+        Body(description="What the rig's factory takes; none: the options that it has."),
+    ] = None,
+) -> RigState:
+    """Begin to check a rig: who its devices are, a white and a black frame of each camera, and what looks wrong.
+
+    `work` of the rig's state tells how far it is and what was found.
+    """
+    return services.rig_desk.start_check(rig, who.user, options)
 
 
 @router.post("/rigs/{rig}/latency", status_code=202)
@@ -150,7 +161,7 @@ def rig_latency(rig: RigName, services: Uses) -> LatencyView | None:
 
 @router.delete("/rigs/{rig}/work")
 def cancel_work(rig: RigName, services: Uses, who: Who) -> RigState:
-    """Have the trial or latency calibration ended that runs."""
+    """Have the check or latency calibration ended that runs."""
     return services.rig_desk.cancel(rig, who.user)
 
 

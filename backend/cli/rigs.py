@@ -108,6 +108,11 @@ def latency(
         rows.add_row(f"{delay_ms:.1f} ms", f"{up:.3f}", f"{down:.3f}")
     console().print(rows)
     console().print(f"settle time {found.settle_ms:.1f} ms, kept in {path}")
+    if found.by_free_run:
+        console().print(
+            f"its cameras run freely: that may be up to {found.resolution_ms:.0f} ms longer than needed, and what their"
+            " readout takes"
+        )
 
 
 def _say_progress(done: float, text: str = "") -> None:

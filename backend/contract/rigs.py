@@ -75,14 +75,6 @@ class RigOffer(Message):
     """Why it can't be used, e.g. a plug-in that failed to load."""
 
 
-class RigCheck(Message):
-    """What `rigs check` found."""
-
-    name: str
-    ok: bool
-    lines: tuple[str, ...]
-
-
 # ---- the rig desk: a rig without a scan
 
 
@@ -216,14 +208,16 @@ class LatencyView(Message):
     kept: bool
     """Kept for the rig: its projector waits as long from now on."""
     note: str = ""
-    """Why it isn't kept, or doesn't count."""
+    """Why it isn't kept, or doesn't count; how coarse it is where cameras can't be triggered."""
+    resolution_ms: float | None = None
+    """So much shorter the slowest change may have been; None: not known."""
 
 
 class RigWork(Message):
-    """What was started at a rig last: its latency calibration, or a trial."""
+    """What was started at a rig last: its latency calibration, or a check."""
 
     kind: str
-    """In words: latency calibration, or trial."""
+    """In words: latency calibration, or check."""
     status: WorkStatus
     who: str
     progress: float
@@ -232,7 +226,7 @@ class RigWork(Message):
     error: str | None = None
     latency: LatencyView | None = None
     lines: tuple[str, ...] = ()
-    """What a trial found."""
+    """What a check found."""
     problems: tuple[str, ...] = ()
     """What looked wrong in it; empty: all is well."""
 

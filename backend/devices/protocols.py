@@ -103,6 +103,12 @@ class CameraCapabilities:
     """In free run: how many frames may wait that were exposed already. After a pattern is lit so many are thrown
     away, and the one that is being exposed then."""
 
+    @property
+    def only_runs_freely(self) -> bool:
+        """Whether frames come by themselves and can't be asked for: neither a webcam nor a file takes triggers."""
+        there = self.trigger_sources
+        return TriggerSource.SOFTWARE not in there and TriggerSource.FREE_RUN in there
+
 
 @dataclass(frozen=True)
 class CameraSettings:

@@ -345,8 +345,7 @@ def settings_of(exposure_ms: float, gain_db: float) -> CameraSettings:
 
 def _trigger(camera: Camera) -> TriggerSource:
     """Return how a camera is told when to expose: by software where it can be."""
-    can = camera.capabilities.trigger_sources
-    free_only = TriggerSource.SOFTWARE not in can and TriggerSource.FREE_RUN in can
+    free_only = camera.capabilities.only_runs_freely
     return TriggerSource.FREE_RUN if free_only else TriggerSource.SOFTWARE
 
 

@@ -1,4 +1,4 @@
-"""Rigs without a scan: devices, live pictures, trial, latency calibration, discovery.
+"""Rigs without a scan: devices, live pictures, check, latency calibration, discovery.
 
 Whatever touches a device is handed over to the rig's thread and looked at later: no call here waits for one.
 """
@@ -21,6 +21,7 @@ from backend.contract.rigs import (
     LiveSettings,
     LiveView,
     RigLink,
+    RigOffer,
     RigOwner,
     RigState,
     RigWork,
@@ -37,8 +38,9 @@ from backend.services.context import Context
 from backend.services.latency import Latency, measure_latency
 from backend.services.rig_trial import try_rig
 from backend.services.rig_works import Found, RigWorks, Work
+from backend.services.rigs import refuse_unknown
 
-LATENCY, TRIAL = "latency calibration", "trial"
+LATENCY, CHECK = "latency calibration", "check"
 
 
 class RigDesk:
@@ -71,8 +73,7 @@ class RigDesk:
         NotFoundError
             If there is no such rig.
         """
-        status, title = self._context.rigs.status(rig), self._title(rig)
-        broken = {offer.name: offer.error for offer in self._context.offers()}.get(rig)
+        status, offer = self._context.rigs.status(rig), self._offer(rig)
         exposure_ms, gain_db = _limits(status)
         settle_ms = _settle_ms(status)
         kept = self._kept(rig)
@@ -81,10 +82,10 @@ class RigDesk:
         )
         return RigState(
             name=rig,
-            title=title,
+            title=offer.title if offer else rig,
             link=status.link,
             options=dict(status.options or {}),
-            failure=status.failure or broken,
+            failure=status.failure or (offer.error if offer else None),
             owner=_owner(status.owner),
             devices=tuple(map(_device, status.devices)),
             exposure_ms=exposure_ms,
@@ -101,20 +102,24 @@ class RigDesk:
     def connect(self, rig: str, options: Mapping[str, Any]) -> RigState:
         """Have a rig opened in the background; one that is open stays as it is.
 
-        Nobody is asked whether there is such a rig: a name may be a package's, `module:factory`.
+        Raises
+        ------
+        NotFoundError
+            If no rig has this name; `package.module:factory` is looked for in the background.
         """
+        refuse_unknown(self._context, rig)
         self._context.rigs.connect(rig, options)
         return self.state(rig)
 
     def disconnect(self, rig: str) -> RigState:
         """Have its devices closed, so that another program can use them; RigBusyError while somebody captures."""
-        self._title(rig)
+        self._offer(rig)
         self._context.rigs.disconnect(rig)
         return self.state(rig)
 
     def reconnect(self, rig: str) -> RigState:
         """Have it closed and opened again with its options; RigBusyError while somebody captures."""
-        self._title(rig)
+        self._offer(rig)
         self._context.rigs.reconnect(rig)
         return self.state(rig)
 
@@ -140,7 +145,7 @@ class RigDesk:
         """Tell what the newest pictures say; asks for none."""
         status = self._context.rigs.status(rig)
         if status.options is None:
-            self._title(rig)  # refuses what isn't there
+            self._offer(rig)  # refuses what isn't there
         cameras = [k.device.name for k in status.devices if _is_camera(k)]
         return LiveView(
             rig=rig,
@@ -175,7 +180,7 @@ class RigDesk:
         InvalidSettingError
             If a value is out of what the cameras can do, or there is no such pattern.
         """
-        self._title(rig)
+        self._offer(rig)
         self._context.rigs.refuse_busy(rig)
         status = self._context.rigs.status(rig)
         exposure_ms, gain_db = _limits(status)
@@ -208,24 +213,34 @@ class RigDesk:
                 control.progress,
                 repetitions=repetitions,
                 who=who,
-                clock=_Cancellable(control),
+                control=control,
             )
             return Found(latency=self._keep(rig, found))
 
         self._works.start(rig, LATENCY, who, measure)
         return self.state(rig)
 
-    def start_trial(self, rig: str, who: str) -> RigState:
-        """Begin to try a rig: a white and a black frame of each camera, and what looks wrong.
+    def start_check(self, rig: str, who: str, options: Mapping[str, Any] | None = None) -> RigState:
+        """Begin to check a rig: a white and a black frame of each camera, and what looks wrong.
+
+        Parameters
+        ----------
+        rig
+            Its name.
+        who
+            Who has it meanwhile.
+        options
+            Opened with these; None: with those that it has.
 
         Raises
         ------
         ConflictError
             If somebody captures, or work runs already.
         """
-        options = self._free(rig)
+        known = self._free(rig)
+        options = known if options is None else options
 
-        def attempt(control: JobControl) -> Found:
+        def check(control: JobControl) -> Found:
             control.progress(0.1, "white and black frames")
             trial = try_rig(self._context, rig, options, who=who, control=control)
             lines = tuple(
@@ -235,7 +250,7 @@ class RigDesk:
             )
             return Found(lines=(*lines, trial.calibration), problems=trial.problems)
 
-        self._works.start(rig, TRIAL, who, attempt)
+        self._works.start(rig, CHECK, who, check)
         return self.state(rig)
 
     def cancel(self, rig: str, who: str) -> RigState:
@@ -245,7 +260,7 @@ class RigDesk:
 
     def latency(self, rig: str) -> LatencyView | None:
         """Return the latency measured last, else the one kept for the rig; None if there is neither."""
-        self._title(rig)
+        self._offer(rig)
         work = self._works.of(rig)
         if work is not None and work.found.latency is not None:
             return work.found.latency
@@ -264,18 +279,24 @@ class RigDesk:
 
     def _free(self, rig: str) -> Mapping[str, Any]:
         """Return the options that a rig has, if nobody captures with it."""
-        self._title(rig)
+        self._offer(rig)
         self._context.rigs.refuse_busy(rig)
         return self._context.rigs.status(rig).options or {}
 
     # ---- what is known
 
-    def _title(self, rig: str) -> str:
-        titles = {offer.name: offer.title for offer in self._context.offers()}
-        if rig not in titles and self._context.rigs.status(rig).options is None:
-            known = ", ".join(titles)
-            raise NotFoundError(f"There is no rig {rig!r}; there are: {known}.")
-        return titles.get(rig, rig)
+    def _offer(self, rig: str) -> RigOffer | None:
+        """Return what is offered under a name; None: nothing, but it was opened as `package.module:factory`.
+
+        Raises
+        ------
+        NotFoundError
+            If there is neither.
+        """
+        offers = {offer.name: offer for offer in self._context.offers()}
+        if rig not in offers and self._context.rigs.status(rig).options is None:
+            raise NotFoundError(f"There is no rig {rig!r}; there are: {', '.join(offers)}.")
+        return offers.get(rig)
 
     def _has_file(self, rig: str) -> bool:
         shelf = self._context.shelf
@@ -312,19 +333,6 @@ class RigDesk:
     def _black_level(self, rig: str, camera: str, status: RigStatus) -> float:
         facts = status.facts.cameras if status.facts else {}
         return facts[camera].black_level_gray if camera in facts else 0.0
-
-
-class _Cancellable:
-    """Real time; waiting for it ends as soon as the work is to end."""
-
-    def __init__(self, control: JobControl) -> None:
-        self._control = control
-
-    def now_s(self) -> float:
-        return time.monotonic()
-
-    def sleep(self, duration_s: float) -> None:
-        self._control.pause(duration_s)
 
 
 def _numbers(camera: str, picture: LivePicture, black_level_gray: float) -> LiveCamera:
@@ -467,7 +475,18 @@ def _latency(found: Latency, *, kept: bool, note: str = "") -> LatencyView:
         down=found.down,
         measured=datetime.fromisoformat(found.measured),
         kept=kept,
-        note=note,
+        note=" ".join(filter(None, (note, _coarseness(found)))),
+        resolution_ms=found.resolution_ms,
+    )
+
+
+def _coarseness(found: Latency) -> str:
+    """Say what cameras that run freely can't tell."""
+    if not found.by_free_run or found.resolution_ms is None:
+        return ""
+    return (
+        f"Its cameras run freely: it may be up to {found.resolution_ms:.0f} ms longer than needed, and what their readout"
+        " takes."
     )
 
 

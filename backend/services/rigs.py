@@ -10,12 +10,10 @@ from backend.contract.rigs import (
     PinholeView,
     PoseView,
     ProjectorView,
-    RigCheck,
     RigOffer,
     RigView,
 )
-from backend.devices.protocols import Device, Rig
-from backend.domain.errors import StageUnavailableError, UnglareError
+from backend.domain.errors import NotFoundError, StageUnavailableError
 from backend.domain.rig import PinholeModel, Pose, RigCalibration, RigFacts
 from backend.jobs.rigs import RigGiven
 from backend.services.context import Context
@@ -26,8 +24,28 @@ _PER_EDGE = 8
 
 
 def view_rig(context: Context, name: str, options: Mapping[str, Any]) -> RigView:
-    """Describe a rig with its options; opens it unless it is known already."""
+    """Describe a rig with its options; opens it unless it is known already.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such rig.
+    """
+    refuse_unknown(context, name)
     return rig_view(name, _title(context, name), options, context.rigs.given(name, options))
+
+
+def refuse_unknown(context: Context, name: str) -> None:
+    """Refuse a name that no rig has; `package.module:factory` is looked for when it is opened.
+
+    Raises
+    ------
+    NotFoundError
+        If there is none; the sentence lists those that there are.
+    """
+    known = [offer.name for offer in context.offers()]
+    if ":" not in name and name not in known:
+        raise NotFoundError(f"There is no rig {name!r}; there are: {', '.join(known)}.")
 
 
 def view_scan_rig(context: Context, scan: str) -> RigView:
@@ -50,15 +68,6 @@ def view_scan_rig(context: Context, scan: str) -> RigView:
     calibration = decode(known.document, RigCalibration, context.store) if known else None
     title = _title(context, row.rig) if row.rig else "Imported frames"
     return rig_view(row.rig, title, row.rig_options, RigGiven(facts, calibration))
-
-
-def check_rig(context: Context, name: str, options: Mapping[str, Any]) -> RigCheck:
-    """Open a rig and say who its devices are; what goes wrong is a line, not an error."""
-    try:
-        lines = context.rigs.use(name, options, _lines)
-    except UnglareError as error:
-        return RigCheck(name=name, ok=False, lines=(error.sentence,))
-    return RigCheck(name=name, ok=True, lines=lines)
 
 
 def rig_view(name: str, title: str, options: Mapping[str, Any], rig: RigGiven) -> RigView:
@@ -159,22 +168,3 @@ def _title(context: Context, name: str) -> str:
 def offers(context: Context) -> tuple[RigOffer, ...]:
     """Return the rigs that a scan can be made with."""
     return context.offers()
-
-
-def _lines(rig: Rig) -> tuple[str, ...]:
-    facts = rig.facts()
-    cameras = [
-        f"{_who(camera)}: {facts.cameras[name].width_px} x {facts.cameras[name].height_px} px, "
-        f"{facts.cameras[name].exposure_min_ms:g} to {facts.cameras[name].exposure_max_ms:g} ms"
-        for name, camera in rig.cameras.items()
-    ]
-    width_px, height_px = rig.projector.capabilities.size
-    projector = f"{_who(rig.projector)}: {width_px} x {height_px} px"
-    calibration = "calibrated" if rig.calibration() else "no calibration: no points, only phase"
-    return (*cameras, projector, calibration)
-
-
-def _who(device: Device) -> str:
-    info = device.info
-    serial = f" {info.serial}" if info.serial else ""
-    return f"{device.name}: {info.vendor} {info.model}{serial}, {device.state.value}"

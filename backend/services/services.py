@@ -17,7 +17,7 @@ from backend.contract.requests import (
     StartRun,
     UndoEdit,
 )
-from backend.contract.rigs import RigCheck, RigOffer, RigView
+from backend.contract.rigs import RigOffer, RigView
 from backend.contract.scans import (
     ArtifactRef,
     AuditEntry,
@@ -357,10 +357,6 @@ class Services:
     def scan_rig(self, scan: str) -> RigView:
         """Describe the rig as a scan has it; see `rigs.view_scan_rig`."""
         return rigs.view_scan_rig(self.context, scan)
-
-    def check_rig(self, name: str, options: Mapping[str, Any]) -> RigCheck:
-        """Open a rig and say who its devices are; see `rigs.check_rig`."""
-        return rigs.check_rig(self.context, name, options)
 
     def live_frame(
         self,

@@ -18,7 +18,7 @@ from backend.devices.errors import DeviceDisconnected
 from backend.devices.pages import PageDesk
 from backend.devices.rig_shelf import RigShelf
 from backend.jobs.rigs import Owner
-from backend.services import latency
+from backend.services import latency, latency_bench, latency_triggered
 from backend.services.rig_desk import RigDesk
 from tests.contract.api_server import VIEWER_TOKEN, api, program, serving, toy_house
 from tests.scans.toy import Faults
@@ -142,7 +142,7 @@ def test_a_rig_that_nobody_knows_is_refused_by_name(bench: Bench) -> None:
     for answer in (
         bench.viewer.get("/api/rigs/nobody/state"),
         bench.viewer.get("/api/rigs/nobody/live"),
-        bench.operator.post("/api/rigs/nobody/trial"),
+        bench.operator.post("/api/rigs/nobody/check"),
     ):
         assert answer.status_code == 404
         assert "no rig 'nobody'" in answer.json()["detail"]
@@ -160,7 +160,7 @@ def test_a_rig_that_nobody_knows_is_refused_by_name(bench: Bench) -> None:
         ("POST", "live", None),
         ("PUT", "live", {"exposure_ms": 5}),
         ("DELETE", "live", None),
-        ("POST", "trial", None),
+        ("POST", "check", None),
         ("POST", "latency", {}),
         ("DELETE", "work", None),
     ],
@@ -190,7 +190,7 @@ def test_who_captures_is_named_and_isnt_disturbed(bench: Bench) -> None:
             ("POST", "disconnect", None),
             ("POST", "reconnect", None),
             ("PUT", "live", {"exposure_ms": 5}),
-            ("POST", "trial", None),
+            ("POST", "check", None),
             ("POST", "latency", {}),
         ):
             answer = bench.operator.request(verb, f"{RIG}/{path}", json=body)
@@ -338,9 +338,9 @@ def worked(bench: Bench) -> dict[str, Any]:
     return dict(bench.state()["work"])
 
 
-def test_a_trial_tells_what_looks_wrong(bench: Bench) -> None:
+def test_a_check_tells_what_looks_wrong(bench: Bench) -> None:
     bench.connect()
-    assert bench.operator.post(f"{RIG}/trial").status_code == 202
+    assert bench.operator.post(f"{RIG}/check").status_code == 202
     work = worked(bench)
 
     assert (work["status"], work["error"]) == ("finished", None)
@@ -348,10 +348,10 @@ def test_a_trial_tells_what_looks_wrong(bench: Bench) -> None:
     assert work["lines"][0].startswith("left: white ")
 
 
-def test_a_trial_is_cancelled_while_a_camera_keeps_it_waiting(bench: Bench) -> None:
+def test_a_check_is_cancelled_while_a_camera_keeps_it_waiting(bench: Bench) -> None:
     bench.connect()
     bench.house.rigs.faults.hold = threading.Event()
-    bench.operator.post(f"{RIG}/trial")
+    bench.operator.post(f"{RIG}/check")
     rig = bench.house.rigs.opened[0]
     until(lambda: rig.cameras["left"].frames == 1)
     assert bench.operator.delete(f"{RIG}/work").status_code == 200
@@ -364,7 +364,8 @@ def test_a_trial_is_cancelled_while_a_camera_keeps_it_waiting(bench: Bench) -> N
 
 @pytest.fixture
 def _hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(latency, "_STEADY_S", 0.0)
+    monkeypatch.setattr(latency_triggered, "STEADY_S", 0.0)
+    monkeypatch.setattr(latency_bench, "STEADY_S", 0.0)
 
 
 @pytest.mark.usefixtures("_hurry")

@@ -392,7 +392,6 @@ def test_the_rig_of_a_scan_is_the_one_it_was_made_with(
 
 def test_a_rig_is_opened_to_be_looked_at(client: httpx.Client) -> None:
     assert client.post("/api/rigs/toy/view", json={}).json()["reference"] == "left"
-    assert client.post("/api/rigs/toy/check", json={}).json()["ok"] is True
     broken = client.post("/api/rigs/other/view", json={"broken": True})
     assert broken.status_code == 502
     assert "doesn't answer" in broken.json()["detail"]

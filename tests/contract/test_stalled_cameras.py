@@ -22,7 +22,7 @@ from backend.services.services import Services
 from tests.contract.api_server import api, program, serving
 from tests.example_driver.acme_unglare import AcmeCamera, AcmeProjector, Options
 from tests.scans.toy import toy_registry
-from tests.scans.toy_house import data_folder
+from tests.scans.toy_house import data_folder, toy_offers
 
 PACE_S = 0.3
 """After that a call counts as stuck."""
@@ -150,6 +150,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
     services = Services(
         database=database, store=store, runner=JobThreads(shop, compute_inline(shop)), rigs=pool,
         registry=toy_registry(), events=hub, version="test", rig_patience_s=PACE_S,
+        offers=toy_offers,
     )  # fmt: skip
     house = type("Served", (), {"services": services})()
     try:
@@ -243,7 +244,7 @@ def test_a_camera_that_doesnt_close_is_left_behind(place: Place) -> None:
     assert job["status"] == "finished", job
 
 
-@pytest.mark.parametrize("work", ["trial", "latency"])
+@pytest.mark.parametrize("work", ["check", "latency"])
 def test_work_at_a_rig_without_a_scan_ends_by_name_too(place: Place, work: str) -> None:
     def told() -> dict[str, Any]:
         return dict(place.client.get("/api/rigs/sulky/state").json())
@@ -259,6 +260,24 @@ def test_work_at_a_rig_without_a_scan_ends_by_name_too(place: Place, work: str) 
         threading.Event().wait(0.1)
     said = " ".join([done["error"] or "", *done["problems"]])
     assert "left: its driver hasn't come back from" in said, done
+    place.trouble.end()
+    assert place.ended(place.start("sulky"))["status"] == "finished"
+
+
+@pytest.mark.parametrize("work", ["check", "latency"])
+def test_work_is_cancelled_while_its_rig_opens(
+    place: Place, work: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SulkyCamera, "answers_within_s", 20.0)
+    place.trouble.call = "open"
+    body = {"repetitions": 3} if work == "latency" else None
+    place.client.post(f"/api/rigs/sulky/{work}", json=body)
+    assert place.trouble.reached.wait(20)
+    assert place.client.delete("/api/rigs/sulky/work").status_code == 200
+    while (told := place.client.get("/api/rigs/sulky/state").json())["owner"] is not None:
+        threading.Event().wait(0.05)
+    assert told["work"]["status"] in ("running", "cancelled")  # its last word comes a moment later
+    assert not place.trouble.over.is_set(), "the camera hangs still"
     place.trouble.end()
     assert place.ended(place.start("sulky"))["status"] == "finished"
 

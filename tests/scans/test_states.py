@@ -150,19 +150,6 @@ def test_a_scan_knows_its_rig(house: House, state: ScanState) -> None:
 def test_a_rig_without_calibration_has_no_models(house: House) -> None:
     view = house.services.rig("toy", {"calibrated": False})
     assert {c.model for c in view.cameras} == {None}
-    assert (
-        house.services.check_rig("toy", {"calibrated": False})
-        .lines[-1]
-        .startswith("no calibration")
-    )
-
-
-def test_a_rig_is_checked_without_raising(house: House) -> None:
-    good = house.services.check_rig("toy", {})
-    assert good.ok
-    assert good.lines[0] == "left: toy camera 1, ready: 24 x 16 px, 0.01 to 100 ms"
-    bad = house.services.check_rig("toy", {"broken": True})
-    assert (bad.ok, bad.lines) == (False, ("Rig 'toy' doesn't answer: switch it on.",))
 
 
 def test_what_was_never_asked_isnt_known(house: House) -> None:

@@ -17,16 +17,24 @@ from backend.contract.requests import (
     StartRun,
     UndoEdit,
 )
+from backend.contract.rigs import RigOffer
 from backend.contract.scans import ScanState, StageState
 from backend.domain.states import Verdict
 from backend.jobs.execution import Workshop
 from backend.jobs.rigs import RigPool
 from backend.jobs.runner import InlineRunner, LocalRunner, Runner
 from backend.services.events import EventHub
+from backend.services.rig_offers import offer_rigs
 from backend.services.services import Services
 from backend.storage.artifacts import LocalArtifactStore
 from backend.storage.database import Database
 from tests.scans.toy import ToyRigs, toy_registry
+
+
+def toy_offers() -> tuple[RigOffer, ...]:
+    """Offer the toys beside the built-in rigs; `ToyRigs` opens whatever it is asked for."""
+    toys = ("toy", "other", "sulky", "late")
+    return (*offer_rigs(), *(RigOffer(name=n, title=n, doc="", options_schema={}) for n in toys))
 
 
 class House:
@@ -60,6 +68,7 @@ class House:
             events=hub,
             version="test",
             rig_patience_s=10.0,
+            offers=toy_offers,
         )
 
     def create(self, *, who: str = "ada", **options: Any) -> ScanState:

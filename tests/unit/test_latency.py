@@ -1,5 +1,6 @@
 """The latency calibration, on a screen that lags by a known time and cameras that integrate its light."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -276,3 +277,114 @@ def test_the_next_rig_of_that_name_has_no_latency(tmp_path: Path) -> None:
     measured(0.02, refresh_hz=60.0).keep(shelf.folder, "bench")
     shelf.remove("bench")
     assert settle_ms(shelf_with_bench(tmp_path, "size: 64x48")) is None
+
+
+class FreeCamera(Camera):
+    """Exposes by its own clock, hands a frame over when it is read out, keeps a few; its rows are exposed in turn."""
+
+    capabilities = CameraCapabilities(
+        (32, 24), ("Mono8",), Range(1000, 1e6), Range(0, 0), (TriggerSource.FREE_RUN,),
+        buffered_frames=2,
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        name: str,
+        screen: LaggingScreen,
+        *,
+        frame_s: float = 1 / 30,
+        readout_s: float = 0.012,
+        longest_us: float = 1e6,
+    ) -> None:
+        super().__init__(name, screen)
+        self.capabilities = replace(
+            self.capabilities, exposure_us=Range(min(1000.0, longest_us), longest_us)
+        )
+        self._frame_s, self._readout_s = frame_s, readout_s
+        self._number = 0
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        assert settings.exposure_us in self.capabilities.exposure_us
+        return super().configure(settings)
+
+    def trigger(self) -> None:
+        raise AssertionError("it can't be triggered")
+
+    def get_frame(self, timeout_s: float = 2.0) -> Frame:
+        clock, exposure_s = self._screen.clock, self.settings.exposure_us * 1e-6
+        arrived = (clock.now_s() - 100.0 - self._readout_s) / self._frame_s
+        oldest = int(arrived) - self.capabilities.buffered_frames
+        self._number = max(self._number + 1, oldest)
+        end_s = 100.0 + self._number * self._frame_s
+        clock.sleep(max(0.0, end_s + self._readout_s - clock.now_s()))
+        self._light = self._screen.light(end_s - exposure_s, end_s)
+        return super().get_frame()
+
+
+def free_run(lag_s: float, *cameras: str, **camera: float) -> latency.Latency:
+    clock = VirtualTime()
+    screen = LaggingScreen(lag_s, clock, refresh_hz=60.0)
+    made = [FreeCamera(name, screen, **camera) for name in cameras or ("left",)]
+    return latency.latency_of(screen, made, _silent, repetitions=10, clock=clock)
+
+
+@pytest.mark.parametrize("lag_ms", [0.0, 20.0, 60.0])
+@pytest.mark.parametrize("frame_s", [1 / 30, 1 / 24.7])
+def test_cameras_that_run_freely_find_the_lag_to_within_a_frame_and_what_readout_takes(
+    lag_ms: float, frame_s: float
+) -> None:
+    found = free_run(lag_ms / 1000.0, "left", "right", frame_s=frame_s)
+    over_ms = found.settle_ms - 1000 / 60
+    assert lag_ms <= over_ms <= lag_ms + 1000 * frame_s + 12.0 + 1000 / 120 + 0.1
+    assert found.resolution_ms == pytest.approx(1000 * frame_s + 1000 / 120)
+    assert found.by_free_run
+    assert found.up[-1] > 0.98
+    assert found.down[-1] > 0.98
+    assert len(found.up) == len(found.down) == len(found.delays_ms)
+
+
+def test_a_fixed_exposure_shorter_than_a_period_is_taken_as_it_is() -> None:
+    found = free_run(0.02, longest_us=5000.0)
+    assert found.exposure_ms == 5.0
+    assert found.settle_ms >= 20.0 + 1000 / 60
+
+
+def test_an_exposure_that_the_rig_file_exaggerates_does_not_shorten_the_latency() -> None:
+    class Boasting(FreeCamera):
+        """Says that it exposes for a second, at 30 frames a second."""
+
+        def get_frame(self, timeout_s: float = 2.0) -> Frame:
+            told, self.settings = self.settings, CameraSettings(10_000.0)
+            frame = super().get_frame()
+            self.settings = told
+            return frame
+
+    clock = VirtualTime()
+    screen = LaggingScreen(0.06, clock, refresh_hz=60.0)
+    camera = Boasting("left", screen)
+    camera.capabilities = replace(camera.capabilities, exposure_us=Range(1e6, 1e6))
+    found = latency.latency_of(screen, [camera], _silent, repetitions=10, clock=clock)
+    assert found.settle_ms >= 60.0 + 1000 / 60
+
+
+def test_frames_that_come_without_time_going_on_end_the_search() -> None:
+    class File(FreeCamera):
+        """Plays pictures as fast as they are fetched."""
+
+        def get_frame(self, timeout_s: float = 2.0) -> Frame:
+            self._light = self._screen.changes[-1][1] if len(self._screen.changes) < 4 else 0.0
+            return Camera.get_frame(self)
+
+    clock = VirtualTime()
+    screen = LaggingScreen(0.0, clock)
+    with pytest.raises(StageFailedError, match="doesn't settle within 400 ms"):
+        latency.latency_of(screen, [File("left", screen)], _silent, repetitions=3, clock=clock)
+
+
+def test_where_one_camera_can_be_triggered_it_measures_alone() -> None:
+    clock = VirtualTime()
+    screen = LaggingScreen(0.02, clock)
+    cameras = [FreeCamera("left", screen), Camera("right", screen)]
+    found = latency.latency_of(screen, cameras, _silent, repetitions=10, clock=clock)
+    assert (found.settle_ms, found.by_free_run) == (measured(0.02).settle_ms, False)
+    assert found.resolution_ms == pytest.approx(1000 * PERIOD_S / 2)
