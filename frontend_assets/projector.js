@@ -11,6 +11,7 @@ let slots = new Map();
 let awaited = null; // the slot that the next binary message fills
 let socket = null;
 let delay = 100;
+let wasOpen = false;
 let lock = null;
 let period = null; // of the screen's refresh, in [ms]; null: not measured yet
 let measuring = 0;
@@ -27,6 +28,20 @@ function geometry() {
     refresh_period_ms: period,
     screen: `${screen.width}x${screen.height}${screen.isExtended ? " of several" : ""}`,
   };
+}
+
+// Pages of ours know who is logged in; the websocket doesn't tell why it was refused.
+async function whyRefused() {
+  try {
+    const answer = await fetch("/api/me", { cache: "no-store" });
+    if (answer.status === 401) return "Nobody is logged in here any more: reload this page and log in.";
+    if (answer.ok && (await answer.json()).role !== "operator") {
+      return "Viewers have no projector: log out, and log in with the operators' token.";
+    }
+  } catch {
+    // the server is gone, which the sentence below says
+  }
+  return "There is no connection to unglare; trying again …";
 }
 
 function send(message) {
@@ -88,14 +103,14 @@ function acknowledge(id) {
 function show(message) {
   const image = slots.get(message.slot);
   if (!image) return send({ t: "error", id: message.id, code: "no-slot" });
-  notice.hidden = true;
+  hideNotice();
   sized(image.width, image.height);
   context.putImageData(image, 0, 0);
   acknowledge(message.id);
 }
 
 function blank(message) {
-  notice.hidden = true;
+  hideNotice();
   sized(message.w, message.h);
   context.fillStyle = `rgb(${message.level} ${message.level} ${message.level})`;
   context.fillRect(0, 0, message.w, message.h);
@@ -115,11 +130,38 @@ function receive(event) {
     awaited = message;
   } else if (message.t === "show") show(message);
   else if (message.t === "blank") blank(message);
+  else if (message.t === "refuse") refuse(message.text);
 }
 
-function say(text) {
-  notice.textContent = text;
+// Words for whoever stands at the projector, read from some metres away; the pattern below them is put out.
+function say(text, hint = "") {
+  context.fillStyle = "#000";
+  context.fillRect(0, 0, canvas.width, canvas.height);
+  notice.firstElementChild.textContent = text;
+  notice.lastElementChild.textContent = hint;
+  notice.className = "";
   notice.hidden = false;
+  document.documentElement.classList.add("speaks");
+}
+
+function refuse(text) {
+  say(text, `This window: ${device.width} × ${device.height} device pixels at ratio ${devicePixelRatio.toFixed(2)}, ` +
+    `${screen.width} × ${screen.height} on its screen.`);
+  notice.className = "refused";
+}
+
+function hideNotice() {
+  notice.hidden = true;
+  document.documentElement.classList.remove("speaks");
+}
+
+function fullScreenHint() {
+  const fills = Math.abs(outerHeight - screen.height) < 2 && Math.abs(innerHeight - outerHeight) < 2;
+  return fills ? "" : "Not full screen: move this window to the projector's monitor and press F11 (or click).";
+}
+
+function greet() {
+  say(`Projector page “${name}” waits for patterns: ${device.width} × ${device.height} device pixels.`, fullScreenHint());
 }
 
 function connect() {
@@ -128,14 +170,19 @@ function connect() {
   socket.binaryType = "arraybuffer";
   socket.onopen = () => {
     delay = 100;
-    say(`Projector page “${name}”: ${device.width} × ${device.height} device pixels, waiting for patterns`);
+    wasOpen = true;
+    greet();
     tellGeometry();
   };
   socket.onmessage = receive;
   socket.onclose = (event) => {
     slots = new Map();
-    if (event.code === 4009) return say("Another page is this projector already: close one of them and reload.");
-    say("The connection is lost; connecting again …");
+    if (event.code === 4009) {
+      return say("Another page is this projector already: close one of them and reload.", "Another projector? Give it a page of its own: /projector?name=…");
+    }
+    if (wasOpen) say("The connection to unglare is lost; connecting again …");
+    else whyRefused().then(say);
+    wasOpen = false;
     setTimeout(connect, delay);
     delay = Math.min(2 * delay, 5000);
   };
@@ -154,6 +201,7 @@ new ResizeObserver((entries) => {
   device = { width: box.inlineSize, height: box.blockSize };
   layOut();
   tellGeometry();
+  if (socket && socket.readyState === WebSocket.OPEN && !notice.hidden) greet();
 }).observe(document.documentElement, { box: "device-pixel-content-box" });
 
 // A zoom keeps the device pixels but changes their ratio: it is watched by itself.
@@ -174,9 +222,14 @@ addEventListener("keydown", (event) => {
 });
 addEventListener("wheel", (event) => { if (event.ctrlKey) event.preventDefault(); }, { passive: false });
 addEventListener("contextmenu", (event) => event.preventDefault());
+// A click on its words fills the screen; on a pattern it does nothing.
+addEventListener("click", () => {
+  if (!notice.hidden && !document.fullscreenElement) document.documentElement.requestFullscreen().catch(() => {});
+});
 document.addEventListener("visibilitychange", () => {
   tellGeometry();
   if (document.visibilityState !== "visible") return;
+  if (!notice.hidden && socket && socket.readyState === WebSocket.OPEN) greet();
   stayAwake();
   measureRefresh();
 });

@@ -7,6 +7,7 @@ Messages to a page are JSON texts; pixels follow as one binary message of gray b
 
     to the page     {"t": "load", "slot": k, "w": .., "h": ..} + pixels     {"t": "show", "id": n, "slot": k}
                     {"t": "blank", "id": n, "level": v, "w": .., "h": ..}
+                    {"t": "refuse", "text": why nothing is shown until that is mended}
     from the page   {"t": "geometry", ...}      {"t": "ack", "id": n, "geometry": {...}}
                     {"t": "error", "id": n, "code": "no-slot"}
 """

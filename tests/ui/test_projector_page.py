@@ -156,7 +156,7 @@ def test_a_second_page_is_refused_and_the_first_goes_on(
 
 def test_viewers_have_no_projector(browser: BrowserContext, address: str, desk: PageDesk) -> None:
     stranger = show_projector(browser, address, VIEWER_TOKEN)
-    stranger.get_by_text("The connection is lost").wait_for()
+    stranger.get_by_text("Viewers have no projector").wait_for()
     assert desk.find("projector") is None
     stranger.close()
 
@@ -194,6 +194,23 @@ def test_a_page_that_grows_in_the_middle_of_a_scan_is_refused(page: Page, desk: 
         page.wait_for_function("() => innerWidth === 500")
         with pytest.raises(GeometryError, match="500x300"):
             projector.blank(0)
+
+
+def test_a_refused_page_says_why_in_words_that_can_be_read_from_afar(
+    page: Page, desk: PageDesk
+) -> None:
+    width, height = true_size(desk)
+    with pytest.raises(GeometryError), opened(desk, (1280, 800)):
+        pass
+    sentence = page.get_by_text("press F11 for full screen")
+    sentence.wait_for()
+    assert f"{width}x{height}" in sentence.inner_text()
+    letters_px = float(sentence.evaluate("p => parseFloat(getComputedStyle(p).fontSize)"))
+    assert letters_px >= height / 20
+    with opened(desk) as projector:
+        projector.blank(0)
+        assert not sentence.is_visible()
+        assert (seen(page, (height, width)) == 0).all()
 
 
 def test_slots_and_levels_that_dont_exist_are_refused(page: Page, desk: PageDesk) -> None:

@@ -31,6 +31,7 @@ class Browser:
         self.geometry: dict[str, float] = GEOMETRY
         self.asked: list[int] = []
         self.loaded = 0
+        self.refused = ""
         self.closed: int | None = None
         page = desk.join("projector", self)
         assert page is not None
@@ -39,6 +40,7 @@ class Browser:
 
     def send_text(self, text: str) -> None:
         message = json.loads(text)
+        self.refused = message["text"] if message["t"] == "refuse" else self.refused
         if "id" in message:
             self.asked.append(message["id"])
             if self.answers:
@@ -134,6 +136,34 @@ def test_a_lost_page_is_opened_again_and_gets_its_patterns(desk: PageDesk) -> No
     threading.Timer(0.05, Browser, (desk,)).start()
     projector.reconnect()
     assert projector.show(0).index == 0
+
+
+def test_a_page_that_is_gone_is_noticed_before_anything_is_asked_of_it(desk: PageDesk) -> None:
+    browser = Browser(desk)
+    projector = opened(desk)
+    assert projector.state is LinkState.READY
+    browser.page.left()
+    assert projector.state is LinkState.LOST
+
+
+@pytest.mark.parametrize(
+    ("change", "cure"),
+    [
+        ({"visible": False}, "bring it to the front"),
+        ({"scale": 1.5}, "zoomed to 150 % by two fingers"),
+        ({"width_px": 80}, "press F11"),
+    ],
+    ids=["hidden", "zoomed", "not full screen"],
+)
+def test_what_is_wrong_with_a_window_is_said_here_and_on_the_page(
+    change: dict[str, float], cure: str, desk: PageDesk
+) -> None:
+    browser = Browser(desk)
+    projector = opened(desk)
+    browser.geometry = {**GEOMETRY, **change}
+    with pytest.raises(GeometryError, match=cure):
+        projector.blank()
+    assert cure in browser.refused
 
 
 def test_a_page_that_fails_is_lost(desk: PageDesk) -> None:

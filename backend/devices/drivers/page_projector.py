@@ -35,6 +35,9 @@ _REFRESH_S = 4.0
 _ASSUMED_REFRESH_HZ = 60.0
 _ALIKE = 0.01
 """Rates that differ by less are the same."""
+HIDDEN = (
+    "the projector page is hidden by another window or tab; bring it to the front of its monitor"
+)
 
 
 class MeasuredLatency(DeviceOptions):
@@ -96,6 +99,14 @@ class PageProjector(Link):
     def capabilities(self) -> ProjectorCapabilities:
         """What it can do."""
         return ProjectorCapabilities(size=self._options.size, refresh_hz=self._refresh_hz)
+
+    @property
+    def state(self) -> LinkState:
+        """Where it is in its life: lost as soon as its page is gone."""
+        page = self._page
+        if self._state is LinkState.READY and page is not None and page.gone:
+            self._state = LinkState.LOST
+        return self._state
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -251,9 +262,7 @@ class PageProjector(Link):
         if page.gone:
             return self._lose_page("the projector page was closed or reloaded")
         if page.geometry is not None and not page.geometry.visible:
-            return GeometryError(
-                self.name, "the projector page is hidden; bring it to the front of its monitor"
-            )
+            return GeometryError(self.name, HIDDEN)
         return DeviceTimeout(
             self.name, f"the projector page didn't draw within {timeout_s:g} s; is it frozen?"
         )
@@ -273,9 +282,11 @@ class PageProjector(Link):
         self._refuse_scaled(geometry)
         if geometry.place != self._place:
             self._state = LinkState.LOST
-            raise GeometryError(
-                self.name,
-                f"the window moved to another place or screen ({_where(geometry)}); put it back and reconnect",
+            raise self._told_page(
+                GeometryError(
+                    self.name,
+                    f"the window moved to another place or screen ({_where(geometry)}); put it back and reconnect",
+                )
             )
 
     def _refuse_scaled(self, geometry: Geometry) -> None:
@@ -283,15 +294,26 @@ class PageProjector(Link):
         width, height = self._options.size
         slack = max(1, math.ceil(geometry.ratio))
         exact = 0 <= geometry.width_px - width < slack and 0 <= geometry.height_px - height < slack
-        if exact and geometry.scale == 1.0 and geometry.visible:
+        if not geometry.visible:
+            problem = HIDDEN
+        elif not exact:
+            problem = (
+                f"the page has {geometry.width_px}x{geometry.height_px} device pixels at ratio {geometry.ratio:g}, the"
+                f" patterns {width}x{height}; press F11 for full screen on the projector's monitor, and let that monitor"
+                f" run at {width}x{height} with a scale of 100 %"
+            )
+        elif geometry.scale != 1.0:
+            problem = f"the page is zoomed to {100 * geometry.scale:.0f} % by two fingers; zoom back to 100 %, or reload it"
+        else:
             return
-        hidden = "" if geometry.visible else ", hidden"
-        raise GeometryError(
-            self.name,
-            f"the page has {geometry.width_px}x{geometry.height_px} device pixels at ratio {geometry.ratio:g}, zoom"
-            f" {geometry.scale:g}{hidden}, the patterns {width}x{height}; show it full screen at 100 % on the"
-            " projector's monitor",
-        )
+        raise self._told_page(GeometryError(self.name, problem))
+
+    def _told_page(self, error: GeometryError) -> GeometryError:
+        """Let whoever stands at the projector read it, too."""
+        page = self._page or self._desk.find(self._options.page)
+        if page is not None:
+            page.send({"t": "refuse", "text": error.sentence})
+        return error
 
 
 def _where(geometry: Geometry) -> str:
