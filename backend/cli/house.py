@@ -117,6 +117,8 @@ def _services_with_page(
         )
     kiosk = Kiosk(settings.data_folder / "kiosk")
     chosen = kiosk.choose(listed_monitors(), monitor) if monitor is not None else None
+    if chosen is not None:  # nobody types the address: another program may have the usual port
+        settings = settings.model_copy(update={"port": 0})
     said: list[tuple[str, str]] = []
     with (
         serve_pages(

@@ -2,6 +2,7 @@
 
 import json
 import re
+import socket
 import subprocess
 import sys
 import threading
@@ -18,7 +19,10 @@ from websockets.sync.connection import Connection
 from websockets.typing import Origin
 
 from backend.cli.application import run
+from backend.domain.errors import StageFailedError
 from backend.main import serve_pages
+from backend.services import kiosk
+from backend.services.kiosk import Kiosk, Monitor
 from backend.settings import load_settings
 from tests.contract.test_plug_ins import Site, example
 
@@ -49,19 +53,21 @@ class Page:
         with connect(
             f"ws://{self.address.host}:{self.address.port}/ws/projector?name={name}",
             origin=Origin(origin), additional_headers={"Cookie": cookie}, proxy=None, max_size=None,
-        ) as socket:  # fmt: skip
-            self._work(socket)
+        ) as connection:  # fmt: skip
+            self._work(connection)
 
-    def _work(self, socket: Connection) -> None:
+    def _work(self, connection: Connection) -> None:
         geometry = {"width_px": 64, "height_px": 48, "ratio": 1.0, "refresh_period_ms": 1000 / 60}
-        socket.send(json.dumps({"t": "geometry", **geometry}))
+        connection.send(json.dumps({"t": "geometry", **geometry}))
         try:
-            for message in socket:
+            for message in connection:
                 if isinstance(message, bytes):
                     self.loads += 1
                 elif "id" in (asked := json.loads(message)):
                     self.shows += asked["t"] == "show"
-                    socket.send(json.dumps({"t": "ack", "id": asked["id"], "geometry": geometry}))
+                    connection.send(
+                        json.dumps({"t": "ack", "id": asked["id"], "geometry": geometry})
+                    )
         except ConnectionClosed:
             return
 
@@ -141,3 +147,17 @@ def test_a_monitor_is_for_rigs_with_a_page(data: str, capsys: pytest.CaptureFixt
         "--monitor 2 is for rigs with a projector page, rig simulated has none"
         in capsys.readouterr().err
     )
+
+
+def test_a_window_that_the_command_opens_needs_no_particular_port(
+    data: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def opened(kiosk: Kiosk, monitor: Monitor, address: str, **door: str | None) -> None:
+        raise StageFailedError(f"opened {address}")
+
+    monkeypatch.setattr(kiosk, "listed_monitors", lambda: (Monitor("M", 0, 0, 64, 48),))
+    monkeypatch.setattr(Kiosk, "opened", opened)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        monkeypatch.setenv("UNGLARE_PORT", str(taken.getsockname()[1]))
+        assert run(["rigs", "check", "--rig", "bench", "--monitor", "1", "--data", data]) == 1
+    assert "unglare: opened http://127.0.0.1:" in capsys.readouterr().err
