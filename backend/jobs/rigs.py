@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from backend.contract.events import Event, RigChanged
 from backend.contract.rigs import RigLink
-from backend.devices.errors import DeviceError
+from backend.devices.errors import DeviceError, IncompleteFrame
 from backend.devices.protocols import (
     CameraCapabilities,
     Device,
@@ -37,6 +37,8 @@ _MOST_WAITING = 4
 _CLOSING_S = 15.0
 """How long the application waits for its rigs when it ends."""
 
+_FEW_INCOMPLETE = 3
+"""So many live pictures in a row may arrive with parts missing before somebody is told."""
 LIVE_HOLD_S = 3.0
 """So long pictures stay live after somebody has asked for them."""
 
@@ -322,6 +324,7 @@ class _Slot:
         self._facts: RigFacts | None = None
         self._link = RigLink.CLOSED
         self._failure: str | None = None
+        self._incomplete = 0
         self._bench: LiveBench | None = None
         self._picture: Future[None] | None = None
         self._wanted_until_s = 0.0
@@ -592,12 +595,15 @@ class _Slot:
         except UnglareError as error:
             if self._link is RigLink.CLOSING:
                 return  # whoever disconnects doesn't want the picture
+            if isinstance(error, IncompleteFrame) and self._incomplete < _FEW_INCOMPLETE:
+                self._incomplete += 1
+                return  # nobody misses it: the next one comes at once
             if error.sentence != self._failure:
                 log.warning("No live picture of rig %r: %s", self.name, error)
             self._failure = error.sentence
             self._leave_if_stuck()
         else:
-            self._failure = None
+            self._failure, self._incomplete = None, 0
 
     def _end_live(self) -> None:
         bench, self._bench = self._bench, None

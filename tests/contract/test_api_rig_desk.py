@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from backend.devices.errors import DeviceDisconnected
+from backend.devices.errors import DeviceDisconnected, IncompleteFrame
 from backend.devices.pages import PageDesk
 from backend.devices.rig_shelf import RigShelf
 from backend.jobs.rigs import Owner
@@ -136,6 +136,25 @@ def test_a_lost_device_says_so_and_comes_back_by_reconnecting(bench: Bench) -> N
 
     assert bench.state()["failure"] is None
     assert bench.picture()["number"] >= 0
+
+
+@pytest.mark.parametrize(("lost", "told"), [(3, False), (30, True)])
+def test_a_few_live_pictures_with_parts_missing_are_nobodys_business(
+    bench: Bench, lost: int, told: bool
+) -> None:
+    bench.connect().set_live(exposure_ms=10)
+    errors = [IncompleteFrame("left", "packets are missing; take it again") for _ in range(lost)]
+    bench.house.rigs.faults.errors = {0: errors}
+    failures = set()
+
+    def noted() -> bool:
+        bench.operator.post(f"{RIG}/live")
+        failures.add(bench.state()["failure"])
+        return told in {bool(f) for f in failures} and (told or len(errors) == 0)
+
+    until(noted)
+    assert failures <= {None, "left: packets are missing; take it again"}
+    assert any(failures) is told
 
 
 def test_a_rig_that_nobody_knows_is_refused_by_name(bench: Bench) -> None:
