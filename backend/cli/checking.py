@@ -64,6 +64,8 @@ def _show(found: "RigTrial") -> None:
         )
     out.print(frames)
     out.print(found.calibration)
+    for note in found.notes:
+        out.print(f"note: {note}")
     for problem in found.problems:
         out.print(f"problem: {problem}")
     if not found.problems:

@@ -417,6 +417,16 @@ class Remarks(Protocol):
 
 
 @runtime_checkable
+class Notes(Protocol):
+    """A device that was found set otherwise than a scan needs it, or as its owner may not know."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what was found when it was opened, a sentence each; nothing of it is wrong now."""
+        ...
+
+
+@runtime_checkable
 class KnowsTruth(Protocol):
     """A rig that knows what it looks at: the simulated one. For a scan's report only, never for a stage."""
 

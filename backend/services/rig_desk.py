@@ -248,7 +248,7 @@ class RigDesk:
                 f"{f.saturated_share:.1%} saturated"
                 for f in trial.frames
             )
-            return Found(lines=(*lines, trial.calibration), problems=trial.problems)
+            return Found(lines=(*lines, trial.calibration, *trial.notes), problems=trial.problems)
 
         self._works.start(rig, CHECK, who, check)
         return self.state(rig)

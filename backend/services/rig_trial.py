@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from backend.devices.errors import DeviceError
-from backend.devices.protocols import Camera, DeviceInfo, Frame, Remarks, Rig
+from backend.devices.protocols import Camera, DeviceInfo, Frame, Notes, Remarks, Rig
 from backend.domain.patterns import BLACK, WHITE
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.jobs.control import JobControl
@@ -58,6 +58,8 @@ class RigTrial:
     calibration: str
     problems: tuple[str, ...]
     """One sentence each; empty: all is well."""
+    notes: tuple[str, ...] = ()
+    """What the devices were found set to, a sentence each: nothing that is wrong now."""
 
     def document(self) -> dict[str, Any]:
         """Write it as JSON values."""
@@ -93,7 +95,13 @@ def _try(name: str, rig: Rig, threads: DeviceThreads, control: JobControl) -> Ri
         frames = _frames(rig, facts, threads, control)
     except DeviceError as error:
         return RigTrial(
-            name, _who(rig.info), devices, (), _calibration_words(calibration), (error.sentence,)
+            name,
+            _who(rig.info),
+            devices,
+            (),
+            _calibration_words(calibration),
+            (error.sentence, *_remarks(rig)),
+            tuple(_notes(rig)),
         )
     return RigTrial(
         name=name,
@@ -102,6 +110,7 @@ def _try(name: str, rig: Rig, threads: DeviceThreads, control: JobControl) -> Ri
         frames=frames,
         calibration=_calibration_words(calibration),
         problems=(*_remarks(rig), *_problems(facts, calibration, frames)),
+        notes=tuple(_notes(rig)),
     )
 
 
@@ -110,6 +119,13 @@ def _remarks(rig: Rig) -> Iterator[str]:
     for device in (rig.projector, *rig.cameras.values()):
         if isinstance(device, Remarks):
             yield from device.remarks
+
+
+def _notes(rig: Rig) -> Iterator[str]:
+    """Return what the devices were found set to when they were opened."""
+    for device in (rig.projector, *rig.cameras.values()):
+        if isinstance(device, Notes):
+            yield from device.notes
 
 
 def _devices(rig: Rig) -> Iterator[TriedDevice]:

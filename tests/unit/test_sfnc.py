@@ -39,6 +39,12 @@ class FakeFeatures:
     def number(self, name: str) -> float:
         return self.numbers[name]
 
+    def flag(self, name: str) -> bool:
+        return self.texts[name] == "on"
+
+    def set_flag(self, name: str, *, value: bool) -> None:
+        self.set_text(name, "on" if value else "off")
+
     def bounds(self, name: str) -> tuple[float, float, float]:
         low, high, step = self.limits[name]
         return low, high, step
@@ -154,11 +160,88 @@ def test_what_a_camera_refuses_leaves_the_old_settings(monkeypatch):
     assert made.read() == before
 
 
-def test_a_tone_curve_that_was_left_behind_is_taken_off():
-    _, features = controls({**OLD_NAMES, "Gamma": (0.45, 0, 4, 0, "")}, TRIGGER)
-    assert features.numbers["Gamma"] == 1.0
-    _, locked = controls({**OLD_NAMES, "Gamma": (0.45, 0, 0.5, 0, "")}, TRIGGER)
+SWITCH = ("off", "on")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "texts", "feature", "set_to", "sentence"),
+    [
+        ({}, {"ExposureAuto": ("Continuous", ("Off", "Once", "Continuous"))}, "ExposureAuto", "Off", "ExposureAuto was Continuous and is Off now"),
+        ({}, {"GainAuto": ("Once", ("Off", "Once"))}, "GainAuto", "Off", "gains change from frame to frame"),
+        ({}, {"TestPattern": ("GreyDiagonalRamp", ("Off", "GreyDiagonalRamp"))}, "TestPattern", "Off", "test images"),
+        ({}, {"SequencerMode": ("On", ("Off", "On"))}, "SequencerMode", "Off", "SequencerMode was On"),
+        ({}, {"BalanceWhiteAuto": ("Continuous", ("Off", "Continuous"))}, "BalanceWhiteAuto", "Off", "colours"),
+        ({}, {"GammaEnable": ("on", SWITCH)}, "GammaEnable", "off", "left: GammaEnable was on and is off now"),
+        ({}, {"LUTEnable": ("on", SWITCH)}, "LUTEnable", "off", "aren't proportional"),
+        ({}, {"ReverseX": ("on", SWITCH)}, "ReverseX", "off", "mirrored, which no calibration knows"),
+        ({}, {"ReverseY": ("on", SWITCH)}, "ReverseY", "off", "upside down"),
+        ({}, {"AcquisitionFrameRateEnable": ("on", SWITCH)}, "AcquisitionFrameRateEnable", "off", "passed over"),
+        ({"DigitalShift": (2.0, 0, 4, 1, "")}, {}, "DigitalShift", 0.0, "DigitalShift was 2 and is 0 now"),
+        ({"TriggerDelay": (500.0, 0, 1e6, 0, "us")}, {}, "TriggerDelay", 0.0, "exposes later"),
+        ({"Gamma": (0.45, 0, 4, 0, "")}, {}, "Gamma", 1.0, "Gamma was 0.45 and is 1 now"),
+        ({}, {"GammaSelector": ("sRGB", ("User", "sRGB"))}, "GammaSelector", "User", "GammaSelector was sRGB"),
+    ],
+)  # fmt: skip
+def test_what_a_viewer_left_on_is_set_and_told(numbers, texts, feature, set_to, sentence):
+    made, features = controls({**OLD_NAMES, **numbers}, {**TRIGGER, **texts})
+    assert {**features.texts, **features.numbers}[feature] == set_to
+    assert len(made.left_on.corrected) == 1
+    assert sentence in made.left_on.corrected[0]
+    assert made.left_on.remaining == ()
+    assert made.notes() == made.left_on.corrected
+    made.prepare()
+    assert not made.left_on.corrected, "nothing to tell a second time"
+
+
+@pytest.mark.parametrize(
+    ("texts", "sentence"),
+    [
+        ({"ExposureAuto": ("Continuous", ("Once", "Continuous"))}, "left: ExposureAuto is Continuous and can't be set to Off"),
+        ({"TestPattern": ("Ramp", ("Ramp",))}, "TestPattern is Ramp and can't be set to Off .*its pictures are test images; set it"),
+    ],
+)  # fmt: skip
+def test_what_spoils_every_scan_and_stays_on_is_refused(texts, sentence):
+    with pytest.raises(FeatureError, match=sentence):
+        controls(OLD_NAMES, {**TRIGGER, **texts})
+
+
+def test_what_stays_on_otherwise_is_a_remark(monkeypatch):
+    monkeypatch.setattr(FakeFeatures, "set_flag", _locked)
+    made, _ = controls(OLD_NAMES, {**TRIGGER, "ReverseX": ("on", SWITCH)})
+    (remark,) = made.left_on.remaining
+    assert remark.startswith(
+        "left: ReverseX is on and can't be set to off (locked by the user set): pictures are"
+    )
+    assert not made.left_on.corrected
+
+
+def _locked(self: FakeFeatures, name: str, *, value: bool) -> None:
+    raise ValueError("locked by the user set")
+
+
+def test_a_tone_curve_that_cannot_be_taken_off_is_a_remark():
+    made, locked = controls({**OLD_NAMES, "Gamma": (0.45, 0, 0.5, 0, "")}, TRIGGER)
     assert locked.numbers["Gamma"] == 0.45
+    assert "Gamma is 0.45 and can't be set to 1" in made.left_on.remaining[0]
+
+
+def test_a_tone_curve_that_is_switched_off_is_no_matter():
+    gamma = {"Gamma": (0.45, 0, 0.5, 0, "")}
+    made, features = controls({**OLD_NAMES, **gamma}, {**TRIGGER, "GammaEnable": ("on", SWITCH)})
+    assert features.texts["GammaEnable"] == "off"
+    assert made.left_on.remaining == ()
+
+
+def test_what_its_owner_may_have_chosen_is_told_and_left():
+    link = {"DeviceLinkThroughputLimitMode": ("On", ("Off", "On"))}
+    limit = {"DeviceLinkThroughputLimit": (25e6, 1e6, 380e6, 1, "Bps")}
+    binned = {"BinningHorizontal": (2.0, 1, 4, 1, ""), "OffsetX": (64.0, 0, 600, 16, "")}
+    made, features = controls({**OLD_NAMES, **binned, **limit}, {**TRIGGER, **link})
+    assert (features.numbers["BinningHorizontal"], features.texts[next(iter(link))]) == (2.0, "On")
+    assert not made.left_on.corrected
+    said = " ".join(made.notes())
+    for words in ("BinningHorizontal is 2.", "OffsetX is 64.", "limited to 25 MB/s"):
+        assert words in said
 
 
 def test_triggers_that_would_hold_frames_back_are_switched_off():

@@ -299,6 +299,10 @@ class AravisFeatures:
         """Return a number."""
         return float(self._call(f"arv_camera_get_{_kind(name)}", name))
 
+    def flag(self, name: str) -> bool:
+        """Tell whether something is on."""
+        return bool(self._call("arv_camera_get_boolean", name))
+
     def bounds(self, name: str) -> tuple[float, float, float]:
         """Return smallest, largest and step; Aravis knows the steps of whole numbers only for sure."""
         whole = _kind(name) == "integer"
@@ -322,6 +326,10 @@ class AravisFeatures:
         kind = _kind(name)
         self._call(f"arv_camera_set_{kind}", name, round(value) if kind == "integer" else value)
 
+    def set_flag(self, name: str, *, value: bool) -> None:
+        """Switch something on or off."""
+        self._call("arv_camera_set_boolean", name, int(value))
+
     def run(self, name: str) -> None:
         """Execute a command."""
         self._call("arv_camera_execute_command", name)
@@ -335,7 +343,18 @@ def _kind(feature: str) -> str:
     return "integer" if feature in _WHOLE else "float"
 
 
-_WHOLE = {"Width", "Height", "OffsetX", "OffsetY", "GainRaw"}
+_WHOLE = {
+    *(
+        "Width",
+        "Height",
+        "OffsetX",
+        "OffsetY",
+        "GainRaw",
+        "DigitalShift",
+        "DeviceLinkThroughputLimit",
+    ),
+    *("BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical"),
+}
 
 
 def _content(buffer: int) -> UInt8[np.ndarray, "n"]:

@@ -78,6 +78,8 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_get_integer_bounds": (None, (_POINTER, _TEXT, ctypes.POINTER(_LONG), ctypes.POINTER(_LONG))),
     "arv_camera_get_integer_increment": (_LONG, (_POINTER, _TEXT)),
     "arv_camera_dup_available_enumerations_as_strings": (ctypes.POINTER(_TEXT), (_POINTER, _TEXT, ctypes.POINTER(_UINT))),
+    "arv_camera_get_boolean": (_BOOL, (_POINTER, _TEXT)),
+    "arv_camera_set_boolean": (None, (_POINTER, _TEXT, _BOOL)),
     "arv_camera_execute_command": (None, (_POINTER, _TEXT)),
     "arv_camera_get_payload": (_UINT, (_POINTER,)),
     "arv_camera_create_stream": (_POINTER, (_POINTER, _POINTER, _POINTER)),

@@ -249,6 +249,10 @@ class GentlFeatures:
         """Return a number."""
         return float(self._nodes.get_node(name).value)
 
+    def flag(self, name: str) -> bool:
+        """Tell whether something is on."""
+        return bool(self._nodes.get_node(name).value)
+
     def bounds(self, name: str) -> tuple[float, float, float]:
         """Return smallest, largest and step."""
         node = self._nodes.get_node(name)
@@ -267,6 +271,10 @@ class GentlFeatures:
         """Set a number."""
         node = self._nodes.get_node(name)
         node.value = value if hasattr(node, "has_inc") else round(value)
+
+    def set_flag(self, name: str, *, value: bool) -> None:
+        """Switch something on or off."""
+        self._nodes.get_node(name).value = value
 
     def run(self, name: str) -> None:
         """Execute a command."""

@@ -278,6 +278,10 @@ class PylonFeatures:
         """Return a number."""
         return float(self._nodes.GetNode(name).GetValue())
 
+    def flag(self, name: str) -> bool:
+        """Tell whether something is on."""
+        return bool(self._nodes.GetNode(name).GetValue())
+
     def bounds(self, name: str) -> tuple[float, float, float]:
         """Return smallest, largest and step."""
         node = self._nodes.GetNode(name)
@@ -296,6 +300,10 @@ class PylonFeatures:
         """Set a number; integers refuse fractions of no value."""
         node = self._nodes.GetNode(name)
         node.SetValue(value if hasattr(node, "HasInc") else round(value))
+
+    def set_flag(self, name: str, *, value: bool) -> None:
+        """Switch something on or off."""
+        self._nodes.GetNode(name).SetValue(value)
 
     def run(self, name: str) -> None:
         """Execute a command."""

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 from pydantic import Field
 
+from backend.devices.drivers.sfnc_overruling import LeftOn, overrule, overrule_trigger, told
 from backend.devices.errors import FeatureError, UnsupportedFeature
 from backend.devices.options import DeviceOptions
 from backend.devices.protocols import CameraCapabilities, CameraSettings, Range, TriggerSource
@@ -62,6 +63,10 @@ class Features(Protocol):
         """Return a number."""
         ...
 
+    def flag(self, name: str) -> bool:
+        """Tell whether something is on."""
+        ...
+
     def bounds(self, name: str) -> tuple[float, float, float]:
         """Return smallest, largest and step (0: any) of a number."""
         ...
@@ -76,6 +81,10 @@ class Features(Protocol):
 
     def set_number(self, name: str, value: float) -> None:
         """Set a number."""
+        ...
+
+    def set_flag(self, name: str, *, value: bool) -> None:
+        """Switch something on or off."""
         ...
 
     def run(self, name: str) -> None:
@@ -116,6 +125,8 @@ class SfncControls:
         self._hardware_timestamp = hardware_timestamp
         self._exposure = self._first(_EXPOSURES)
         self._gain = next((n for n in _GAINS if self._is_in_db(n)), "")
+        self.left_on = LeftOn((), ())
+        """What a viewer left behind; known after `prepare`."""
         self._raw_gain = "" if self._gain or not options.gain_db_per_step else self._first((_RAW_GAIN,))  # fmt: skip
 
     def _first(self, names: tuple[str, ...]) -> str:
@@ -131,11 +142,10 @@ class SfncControls:
         """Overrule what else was set before us: automatics off, one trigger per frame, a format that we read."""
         features = self._features
         for name, value in (
-            ("AcquisitionMode", "Continuous"), ("ExposureMode", "Timed"), ("ExposureAuto", "Off"),
-            ("GainAuto", "Off"), ("GainSelector", "All"),
+            ("AcquisitionMode", "Continuous"), ("ExposureMode", "Timed"), ("GainSelector", "All"),
         ):  # fmt: skip
             self._set_if_possible(name, value)
-        self._make_linear()
+        self.left_on = overrule(self._camera, features)
         self._choose_format()
         self._read_region()
         for selector in features.choices("TriggerSelector"):  # another one may hold frames back
@@ -143,13 +153,8 @@ class SfncControls:
             self._set_if_possible("TriggerMode", "Off")
         self._set_if_possible("TriggerSelector", "FrameStart")
         self._set_if_possible("TriggerActivation", "RisingEdge")
+        self.left_on += overrule_trigger(self._camera, features)
         self._set_trigger(self._sources()[0])
-
-    def _make_linear(self) -> None:
-        """Take a tone curve off that a viewer left behind: fringes bend with it. One that is off can't be written."""
-        if self._features.has("Gamma") and self._features.number("Gamma") != 1.0:
-            with suppress(Exception):
-                self._features.set_number("Gamma", 1.0)
 
     def _choose_format(self) -> None:
         formats, wanted = self._formats(), self._options.pixel_format
@@ -188,6 +193,10 @@ class SfncControls:
                     f"{name} {value} of region {list(region)} is not within {allowed} in steps of {step:g}; choose another",
                 )
             self._features.set_number(name, value)
+
+    def notes(self) -> tuple[str, ...]:
+        """Say what was set otherwise than found, and what its owner should know of; after `prepare`."""
+        return (*self.left_on.corrected, *told(self._camera, self._features))
 
     # ------------------------------------------------------------ what it can
 

@@ -30,6 +30,18 @@ class SfncCamera(LibraryCamera):
         self._sfnc_options = options
         self._fewest_buffers = fewest_buffers
         self._known_controls: SfncControls | None = None
+        self._notes: tuple[str, ...] = ()
+        self._remarks: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Say what was found set otherwise than a scan needs it, and what its owner should know of."""
+        return self._notes
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Say what is doubtful: what a viewer left on, and can't be switched off from here."""
+        return self._remarks
 
     @property
     def _controls(self) -> SfncControls:
@@ -46,6 +58,8 @@ class SfncCamera(LibraryCamera):
             hardware_timestamp=hardware_timestamp,
         )
         self._known_controls.prepare()
+        self._notes = self._known_controls.notes()
+        self._remarks = self._known_controls.left_on.remaining
 
     def _buffers_for(self, n_frames: int | None) -> int:
         """Return how many buffers an acquisition of so many frames is given; None: as many as come."""

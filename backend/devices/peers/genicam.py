@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from backend.devices.peers.gvcp import Bootstrap
+from backend.devices.peers.processing import TEST_PATTERNS
 from backend.devices.protocols import Range
 
 FEATURES = 0x8000
@@ -39,6 +40,15 @@ TRIGGER_SOFTWARE = Register(FEATURES + 0x2C, access="WO")
 TRIGGER_ACTIVATION = Register(FEATURES + 0x30)
 EXPOSURE_TIME = Register(FEATURES + 0x40, 8)
 GAIN = Register(FEATURES + 0x48, 8)
+TEST_PATTERN = Register(FEATURES + 0x50)
+REVERSE_X = Register(FEATURES + 0x54)
+GAMMA_ENABLE = Register(FEATURES + 0x58)
+RATE_ENABLE = Register(FEATURES + 0x5C)
+GAMMA = Register(FEATURES + 0x60, 8)
+RATE = Register(FEATURES + 0x68, 8)
+
+GAMMAS = Range(0.25, 4.0)
+RATES_HZ = Range(0.1, 1000.0, unit="Hz")
 
 TRIGGER_MODES = {"Off": 0, "On": 1}
 TRIGGER_SOURCES = {"Software": 0, "Line0": 1, "Line1": 2}
@@ -72,8 +82,10 @@ def describe(camera: CameraDescription) -> bytes:
     _device(writer)
     _image(writer, camera)
     _acquisition(writer, camera)
-    writer.category("AnalogControl", ["Gain"])
+    writer.category("AnalogControl", ["Gain", "GammaEnable", "Gamma"])
     writer.floating("Gain", GAIN, camera.gain_db)
+    writer.boolean("GammaEnable", GAMMA_ENABLE)
+    writer.floating("Gamma", GAMMA, GAMMAS)
     _transport(writer, camera)
     port = writer.add("Port", "Device")
     del port
@@ -94,17 +106,22 @@ def _device(writer: "_Writer") -> None:
 
 
 def _image(writer: "_Writer", camera: CameraDescription) -> None:
-    writer.category("ImageFormatControl", ["Width", "Height", "PixelFormat"])
+    writer.category(
+        "ImageFormatControl", ["Width", "Height", "PixelFormat", "ReverseX", "TestPattern"]
+    )
     writer.integer("Width", WIDTH)
     writer.integer("Height", HEIGHT)
     writer.choice("PixelFormat", PIXEL_FORMAT, camera.pixel_formats)
+    writer.boolean("ReverseX", REVERSE_X)
+    writer.choice("TestPattern", TEST_PATTERN, TEST_PATTERNS)
 
 
 def _acquisition(writer: "_Writer", camera: CameraDescription) -> None:
     writer.category(
         "AcquisitionControl",
         ["AcquisitionMode", "AcquisitionStart", "AcquisitionStop", "TriggerSelector", "TriggerMode",
-         "TriggerSource", "TriggerSoftware", "TriggerActivation", "ExposureTime"],
+         "TriggerSource", "TriggerSoftware", "TriggerActivation", "ExposureTime", "AcquisitionFrameRateEnable",
+         "AcquisitionFrameRate"],
     )  # fmt: skip
     sources = {name: TRIGGER_SOURCES[name] for name in camera.trigger_sources}
     writer.choice("AcquisitionMode", ACQUISITION_MODE, {"Continuous": 0})
@@ -116,6 +133,8 @@ def _acquisition(writer: "_Writer", camera: CameraDescription) -> None:
     writer.command("TriggerSoftware", TRIGGER_SOFTWARE)
     writer.choice("TriggerActivation", TRIGGER_ACTIVATION, {"RisingEdge": 0})
     writer.floating("ExposureTime", EXPOSURE_TIME, camera.exposure_us)
+    writer.boolean("AcquisitionFrameRateEnable", RATE_ENABLE)
+    writer.floating("AcquisitionFrameRate", RATE, RATES_HZ)
 
 
 def _transport(writer: "_Writer", camera: CameraDescription) -> None:
@@ -167,10 +186,15 @@ class _Writer:
 
     def floating(self, name: str, register: Register, allowed: Range) -> None:
         """Add a number with its range and unit."""
-        self.add(
-            "Float", name, pValue=f"{name}Register", Min=repr(allowed.min), Max=repr(allowed.max), Unit=allowed.unit
-        )  # fmt: skip
+        unit = {"Unit": allowed.unit} if allowed.unit else {}
+        limits = {"Min": repr(allowed.min), "Max": repr(allowed.max)}
+        self.add("Float", name, pValue=f"{name}Register", **limits, **unit)
         self._place("FloatReg", name, register, Endianess="BigEndian")
+
+    def boolean(self, name: str, register: Register) -> None:
+        """Add a switch."""
+        self.add("Boolean", name, pValue=f"{name}Register", OnValue=1, OffValue=0)
+        self._register("IntReg", name, register)
 
     def choice(self, name: str, register: Register, entries: Mapping[str, int]) -> None:
         """Add an enumeration."""

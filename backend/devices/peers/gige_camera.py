@@ -12,7 +12,9 @@ import struct
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,7 @@ from backend.devices.peers.gvcp import (
     parse_request,
 )
 from backend.devices.peers.gvsp import PIXEL_FORMATS, Block, next_block_id
+from backend.devices.peers.processing import TEST_PATTERNS, Processing
 from backend.devices.peers.registers import Registers, Writer
 from backend.devices.protocols import Camera, CameraSettings, Frame, Range, TriggerSource
 
@@ -183,6 +186,8 @@ class GigECamera:
         registers.number(Bootstrap.PACKET_SIZE, 1500)
         registers.memory(features.XML_ADDRESS, xml)
         registers.number(features.TRIGGER_MODE.address, features.TRIGGER_MODES["On"])
+        registers.memory(features.GAMMA.address, struct.pack(">d", 1.0))
+        registers.memory(features.RATE.address, struct.pack(">d", 30.0))
         registers.number(features.WIDTH.address, width_px)
         registers.number(features.HEIGHT.address, height_px)
         self._allow_writes()
@@ -194,6 +199,8 @@ class GigECamera:
             features.ACQUISITION_MODE.address, features.PARAMETERS_LOCKED.address,
             features.TRIGGER_SELECTOR.address, features.TRIGGER_ACTIVATION.address,
         )  # fmt: skip
+        switches = features.REVERSE_X, features.GAMMA_ENABLE, features.RATE_ENABLE
+        numbers = (features.GAMMA, features.GAMMAS), (features.RATE, features.RATES_HZ)
         acting: dict[int, Writer] = {
             Bootstrap.PACKET_SIZE: self._set_packet_size,
             features.PIXEL_FORMAT.address: self._set_pixel_format,
@@ -207,6 +214,15 @@ class GigECamera:
         }
         for address in plain:
             self._registers.writable(address, 4, None)
+        for register, allowed in (
+            (features.TEST_PATTERN, tuple(TEST_PATTERNS.values())),
+            *((switch, (0, 1)) for switch in switches),
+        ):
+            keep = partial(self._keep_number, register.address, allowed)
+            self._registers.writable(register.address, 4, keep)
+        for register, limits in numbers:
+            keep = partial(self._keep_double, register.address, limits)
+            self._registers.writable(register.address, 8, keep)
         for address, act in acting.items():
             doubles = (features.EXPOSURE_TIME.address, features.GAIN.address)
             self._registers.writable(address, 8 if address in doubles else 4, act)
@@ -230,6 +246,33 @@ class GigECamera:
             locked = self._acquiring.is_set() and not {"exposure_us", "gain_db"} & set(changes)
             raise RefusedError(Status.BUSY if locked else Status.INVALID_PARAMETER) from error
         self._show_settings(taken)
+
+    def _keep_number(self, address: int, allowed: Sequence[int], data: bytes) -> None:
+        if int.from_bytes(data) not in allowed:
+            raise RefusedError(Status.INVALID_PARAMETER)
+        self._registers.number(address, int.from_bytes(data))
+
+    def _keep_double(self, address: int, allowed: Range, data: bytes) -> None:
+        if _double(data) not in allowed:
+            raise RefusedError(Status.INVALID_PARAMETER)
+        self._registers.memory(address, data)
+
+    @property
+    def _processing(self) -> Processing:
+        number, registers = self._registers.read_number, self._registers
+        gamma = _double(registers.read(features.GAMMA.address, 8))
+        return Processing(
+            test_pattern=number(features.TEST_PATTERN.address),
+            reverse_x=bool(number(features.REVERSE_X.address)),
+            gamma=gamma if number(features.GAMMA_ENABLE.address) else 1.0,
+        )
+
+    @property
+    def _least_period_s(self) -> float:
+        """Shortest time between two exposures that the frame rate allows; 0 where it isn't limited."""
+        if not self._registers.read_number(features.RATE_ENABLE.address):
+            return 0.0
+        return 1.0 / _double(self._registers.read(features.RATE.address, 8))
 
     def _set_pixel_format(self, data: bytes) -> None:
         names = {code: name for name, code in PIXEL_FORMATS.items()}
@@ -388,7 +431,8 @@ class GigECamera:
             self.dropped_triggers += 1
             return
         readout_s = self._camera.capabilities.min_frame_period_s
-        self._free_at_s = now_s + settings.exposure_us * 1e-6 + readout_s
+        cycle_s = settings.exposure_us * 1e-6 + readout_s
+        self._free_at_s = now_s + max(cycle_s, self._least_period_s)
         self._camera.trigger()
 
     def _send_frames(self) -> None:
@@ -398,6 +442,8 @@ class GigECamera:
             acquisition = self._acquisitions
             try:
                 if self._runs_freely:
+                    self._ending.wait(max(0.0, self._free_at_s - time.monotonic()))
+                    self._free_at_s = time.monotonic() + self._least_period_s
                     self._camera.trigger()
                 frame = self._camera.get_frame(timeout_s=_POLL_S)
             except DeviceTimeout:
@@ -416,8 +462,9 @@ class GigECamera:
 
     def _send_block(self, frame: Frame) -> None:
         self._block_id = next_block_id(self._block_id)
-        height_px, width_px = frame.data.shape
-        pixels = np.ascontiguousarray(frame.data, frame.data.dtype.newbyteorder("<"))
+        picture = self._processing.of(frame.data, frame.bits)
+        height_px, width_px = picture.shape
+        pixels = np.ascontiguousarray(picture, picture.dtype.newbyteorder("<"))
         block = Block(
             block_id=self._block_id,
             timestamp_ticks=round((frame.timestamp_s or frame.host_time_s) * _TICKS_PER_S),
