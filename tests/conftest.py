@@ -21,6 +21,7 @@ import pytest
 
 from backend.storage.artifacts import LocalArtifactStore
 from backend.storage.database import Database
+from tests.loopback import loopback_address
 
 _READY = "database system is ready to accept connections"
 _NUMBERS = itertools.count()
@@ -30,6 +31,12 @@ _NUMBERS = itertools.count()
 def store(tmp_path: Path) -> LocalArtifactStore:
     """Keep artifacts in the test's folder, without waiting for the disk."""
     return LocalArtifactStore(tmp_path / "artifacts", durable=False)
+
+
+@pytest.fixture
+def addresses() -> tuple[str, str]:
+    """Two loopback addresses for devices: no other test has them, in this process or another."""
+    return loopback_address(), loopback_address()
 
 
 @pytest.fixture(params=["sqlite", "postgres"])

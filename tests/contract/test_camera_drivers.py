@@ -193,7 +193,6 @@ def test_a_pylon_camera_that_is_not_there_is_one_sentence(options, sentence):
 # ---------------------------------------------------------------- Aravis
 
 
-@pytest.mark.xdist_group("aravis-fake-camera")
 class TestAravisOnItsOwnFakeCamera(RigConformance):
     """Somebody else's GigE Vision camera: old names of features, frame numbers that wrap, light of its own."""
 

@@ -39,13 +39,6 @@ SMALL = {"scene": "plane", "size": "160x120", "projector_size": "160x100", "real
 
 
 @pytest.fixture
-def addresses(worker_id: str) -> tuple[str, str]:
-    """Two addresses that no other test process uses."""
-    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 99
-    return f"127.78.{number}.2", f"127.78.{number}.3"
-
-
-@pytest.fixture
 def cameras(addresses: tuple[str, str]) -> Iterator[tuple[str, str]]:
     with create_rig(SMALL) as rig, ExitStack() as stack:
         for camera, address in zip(rig.cameras.values(), addresses, strict=True):

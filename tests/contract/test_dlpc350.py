@@ -658,16 +658,9 @@ def test_without_hidapi_the_sentence_says_what_to_install(folder, monkeypatch):
 try:
     aravis()
 except AravisMissingError as error:
-    needs_aravis = pytest.mark.skip(reason=str(error))
+    needs_aravis = pytest.mark.skipif(True, reason=str(error))
 else:
-    needs_aravis = pytest.mark.xdist_group("gige-vision")
-
-
-@pytest.fixture
-def addresses(worker_id: str) -> tuple[str, str]:
-    """Two addresses that no other test process uses: all of 127.0.0.0/8 is this machine."""
-    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 99
-    return f"127.81.{number}.2", f"127.81.{number}.3"
+    needs_aravis = pytest.mark.skipif(False, reason="Aravis is installed.")
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """GigE Vision for real: the Aravis driver against cameras that speak the protocol, over loopback."""
 
 import socket
-import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -23,7 +22,6 @@ from backend.devices.errors import (
     FeatureError,
     IncompleteFrame,
 )
-from backend.devices.peers import genicam as peer_features
 from backend.devices.peers.gige_camera import GigECamera, Wire
 from backend.devices.peers.gvcp import PORT, Command, ask, request
 from backend.devices.protocols import LinkState, TriggerSource
@@ -81,44 +79,6 @@ def test_known_addresses_are_asked_one_by_one(addresses):
     assert {f.address: f.serial for f in found} == dict(
         zip(addresses, ("SIM-L", "SIM-R"), strict=True)
     )
-
-
-VIEWER_LEFT_ON = {
-    "TestPattern": (peer_features.TEST_PATTERN, (1).to_bytes(4), "its pictures are test images"),
-    "ReverseX": (peer_features.REVERSE_X, (1).to_bytes(4), "mirrored"),
-    "GammaEnable": (peer_features.GAMMA_ENABLE, (1).to_bytes(4), "aren't proportional"),
-    "AcquisitionFrameRateEnable": (peer_features.RATE_ENABLE, (1).to_bytes(4), "passed over"),
-}
-
-
-def test_what_a_viewer_left_on_is_switched_off_and_told(addresses):
-    """All of it at once: pictures are those of a camera that nobody has touched."""
-    with network(addresses) as (simulated, peers):
-        simulated.projector.blank(255)
-        with opened(addresses) as camera:
-            assert camera.notes == ()
-            camera.arm()
-            camera.trigger()
-            untouched = camera.get_frame().data.astype(float)
-        for register, value, _ in VIEWER_LEFT_ON.values():
-            peers[0]._registers.write(register.address, value)
-        peers[0]._registers.write(peer_features.GAMMA.address, struct.pack(">d", 0.45))
-        peers[0]._registers.write(peer_features.RATE.address, struct.pack(">d", 0.5))
-        ramp = peers[0]._processing.of(np.zeros((120, 160), np.uint8), 8)
-        assert ramp[0, 0] == 255, "it would do what it is set to"
-        with opened(addresses) as camera:
-            notes = camera.notes
-            camera.arm()
-            pictures = []
-            for _ in range(2):  # with a frame in two seconds the second one would be passed over
-                camera.trigger()
-                pictures.append(camera.get_frame(timeout_s=1.0).data.astype(float))
-            assert camera.remarks == ()
-    assert len(notes) == len(VIEWER_LEFT_ON)
-    for feature, (_, _, words) in VIEWER_LEFT_ON.items():
-        assert any(f"left: {feature} was" in n and words in n for n in notes), (feature, notes)
-    for picture in pictures:
-        assert abs(picture - untouched).mean() < 0.5 * abs(picture - untouched[:, ::-1]).mean()
 
 
 def test_nobody_at_the_address_is_one_sentence(addresses):

@@ -15,13 +15,12 @@ from backend.devices.peers.monitor_display import MonitorDisplay, MonitorHistory
 from backend.devices.peers.simulated_cameras import Peer, PeerProcess
 from backend.devices.protocols import TriggerSource
 from backend.domain.errors import CancelledError, StartupError
+from tests.loopback import loopback_address
 
 try:
     aravis()
 except AravisMissingError as error:
     pytest.skip(str(error), allow_module_level=True)
-
-pytestmark = pytest.mark.xdist_group("gige-vision")
 
 SIZE = (160, 100)
 OPTIONS = {
@@ -33,9 +32,8 @@ OPTIONS = {
 
 
 @pytest.fixture(scope="module")
-def address(worker_id: str) -> str:
-    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 99
-    return f"127.77.{number}.7"
+def address() -> str:
+    return loopback_address()
 
 
 @pytest.fixture(scope="module")

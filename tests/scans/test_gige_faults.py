@@ -24,15 +24,7 @@ try:
 except AravisMissingError as error:
     pytest.skip(str(error), allow_module_level=True)
 
-pytestmark = pytest.mark.xdist_group("gige-vision")
-
 CAMERAS = ("left", "right")
-
-
-@pytest.fixture
-def addresses(worker_id: str) -> tuple[str, str]:
-    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 99
-    return f"127.77.{number}.4", f"127.77.{number}.5"
 
 
 @contextmanager

@@ -25,7 +25,7 @@ try:
 except AravisMissingError as error:
     pytest.skip(str(error), allow_module_level=True)
 
-pytestmark = [pytest.mark.scan, pytest.mark.xdist_group("gige-vision")]
+pytestmark = pytest.mark.scan
 
 WIDTH, HEIGHT = protocol.SIZE_PX
 
@@ -53,10 +53,8 @@ def written(calibration: RigCalibration) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("unplugged_at", [None, 24], ids=["undisturbed", "unplugged"])
-def test_a_scan_plays_from_flash_and_every_frame_comes(tmp_path, worker_id, unplugged_at):
+def test_a_scan_plays_from_flash_and_every_frame_comes(tmp_path, addresses, unplugged_at):
     """Also where the cable is pulled in the middle of a sequence: the scan takes the device back and goes on."""
-    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 98
-    addresses = [f"127.82.{number}.2", f"127.82.{number}.3"]
     fringes = _design(ExposuresParams()).patterns(ProjectorFacts(WIDTH, HEIGHT))
     folder = stored(tmp_path / "set", *fringes, WHITE, BLACK)
     with lightcrafter_hardware(addresses, folder) as (device, simulated):

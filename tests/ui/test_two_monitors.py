@@ -16,6 +16,7 @@ from backend.devices.drivers.aravis_library import AravisMissingError, aravis
 from backend.devices.peers.monitor_display import Screen
 from backend.devices.sim.config import SimulatedRigConfig
 from backend.devices.sim.rig import SimulatedRig
+from tests.loopback import loopback_address
 from tests.ui.test_projector_page import patterns
 from tests.ui.two_monitors import (
     SIZE,
@@ -35,8 +36,6 @@ except AravisMissingError as error:
 pytestmark = pytest.mark.ui
 
 WORLD: dict[str, Any] = {"scene": "plane", "size": "320x240", "seed": 5}
-CAMERAS = ("127.78.0.2", "127.78.0.3")
-LATE_CAMERAS = ("127.78.0.4", "127.78.0.5")
 MOST_COLUMN_ERROR_PX = 0.02
 BRIEF: dict[str, dict[str, Any]] = {"exposures": {"exposures_ms": [50.0]}}
 """One exposure: 12 shots."""
@@ -48,7 +47,10 @@ def desktop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desktop]:
         yield running
 
 
-def simulate(desktop: Desktop, name: str, addresses: tuple[str, str], *more: str) -> Program:
+Addresses = tuple[str, str]
+
+
+def simulate(desktop: Desktop, name: str, addresses: Addresses, *more: str) -> Program:
     """Start `unglare simulate-hardware`; its rig file is NAME.yaml."""
     options = [f"--{key}={value}" for key, value in WORLD.items()]
     options += [f"--address={address}" for address in addresses]
@@ -59,15 +61,13 @@ def simulate(desktop: Desktop, name: str, addresses: tuple[str, str], *more: str
 
 
 @contextmanager
-def simulated(
-    desktop: Desktop, station: Station, name: str, addresses: tuple[str, str], *more: str
-) -> Iterator[Program]:
-    program = simulate(desktop, name, addresses, *more)
+def simulated(desktop: Desktop, station: Station, name: str, *more: str) -> Iterator[Program]:
+    program = simulate(desktop, name, (loopback_address(), loopback_address()), *more)
     try:
         program.wait_until_it_says("Stop with Ctrl")
         station.add_rig(desktop.folder / f"{name}.yaml", name)
         yield program
-    finally:  # the next test's cameras have the same addresses
+    finally:
         status = program.stop(signal.SIGINT)
     assert status == 0, program.said
 
@@ -80,7 +80,7 @@ def station(desktop: Desktop) -> Iterator[Station]:
 
 @pytest.fixture(scope="module")
 def hardware(desktop: Desktop, station: Station) -> Iterator[Program]:
-    with simulated(desktop, station, "room", CAMERAS) as running:
+    with simulated(desktop, station, "room") as running:
         yield running
 
 
@@ -161,7 +161,7 @@ def test_an_unattended_scan_with_real_protocols_is_as_good_as_its_noise(
 def test_injected_lag_is_found_and_the_scan_is_as_good(
     desktop: Desktop, window: Window, station: Station
 ) -> None:
-    with simulated(desktop, station, "late", LATE_CAMERAS, "--lag-ms=60"):
+    with simulated(desktop, station, "late", "--lag-ms=60"):
         station.give_page_to("late")
         station.post("/api/rigs/late/latency", repetitions=10)
         wait_for(lambda: station.get("/api/rigs/late/latency"), "the latency calibration")
@@ -175,7 +175,7 @@ def test_injected_lag_is_found_and_the_scan_is_as_good(
 def test_without_settling_the_checks_refuse_a_lagging_projector(
     desktop: Desktop, window: Window, station: Station
 ) -> None:
-    with simulated(desktop, station, "hasty", LATE_CAMERAS, "--lag-ms=60"):
+    with simulated(desktop, station, "hasty", "--lag-ms=60"):
         file = desktop.folder / "hasty.yaml"
         file.write_text(file.read_text().replace("  gamma:", "  settle_ms: 0.0\n  gamma:"))
         station.add_rig(file, "hurried")
@@ -205,17 +205,17 @@ def test_every_pixel_of_the_second_monitor_is_as_asked(
 
 @pytest.mark.parametrize("shot", [4])
 def test_a_camera_that_is_killed_in_mid_scan_and_comes_back(
-    desktop: Desktop, station: Station, window: Window, shot: int
+    desktop: Desktop, station: Station, window: Window, addresses: Addresses, shot: int
 ) -> None:
     with ExitStack() as stopping:
-        program = simulate(desktop, "frail", LATE_CAMERAS)
+        program = simulate(desktop, "frail", addresses)
         stopping.callback(program.stop)
         program.wait_until_it_says("Stop with Ctrl")
         station.add_rig(desktop.folder / "frail.yaml", "frail")
         scan = station.scan("frail", **BRIEF).start("fringe_capture")
         scan.wait_for_shot(shot)
         program.stop(signal.SIGKILL)
-        again = simulate(desktop, "frail", LATE_CAMERAS)
+        again = simulate(desktop, "frail", addresses)
         stopping.callback(again.stop)
         again.wait_until_it_says("Stop with Ctrl")
         ends_or_goes_on(scan)
