@@ -115,7 +115,7 @@ def _services_with_page(
             f"Rig {rig} shows its patterns in projector page {page!r}, and a server runs on {settings.data_folder}: the"
             " page is with that one. Use the rig there, in the browser or by the API, or stop the server first."
         )
-    kiosk = Kiosk(settings.data_folder / "kiosk")
+    kiosk = Kiosk(settings.data_folder / "kiosk" / "of-commands")  # which are alone in the folder
     chosen = kiosk.choose(listed_monitors(), monitor) if monitor is not None else None
     if chosen is not None:  # nobody types the address: another program may have the usual port
         settings = settings.model_copy(update={"port": 0})

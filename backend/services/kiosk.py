@@ -3,7 +3,9 @@
 import contextlib
 import html
 import os
+import select
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,6 +14,7 @@ from urllib.parse import urlencode
 
 from backend.domain.errors import NotFoundError, StartupError
 
+_CLOSING_S = 10.0
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _FLAGS = (
     "--kiosk", "--force-device-scale-factor=1", "--force-color-profile=srgb",  # no pixel is scaled or converted
@@ -97,12 +100,16 @@ class Kiosk:
     ) -> Iterator[None]:
         """Show the page as long as the block runs; the window is closed behind it.
 
+        A window that a killed command left behind is closed before: its browser would open this page, too, and keep
+        it. So nobody else may use the profile meanwhile.
+
         Raises
         ------
         StartupError
             If no browser is installed.
         """
         command = self.command(monitor, address, name=name, token=token)
+        self._close_left_over()
         # In a group of its own: Ctrl+C is the command's, which closes the window when it is done.
         browser = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)  # noqa: S603  our own words
         try:
@@ -110,10 +117,32 @@ class Kiosk:
         finally:
             browser.terminate()
             try:
-                browser.wait(timeout=10)
+                browser.wait(timeout=_CLOSING_S)
             except subprocess.TimeoutExpired:
                 browser.kill()
                 browser.wait()
+
+    def _close_left_over(self) -> None:
+        profile = self._folder / "profile"
+        try:
+            pid = int((profile / "SingletonLock").readlink().name.rpartition("-")[2])  # HOST-PID
+            if (
+                os.fsencode(f"--user-data-dir={profile}")
+                not in Path(f"/proc/{pid}/cmdline").read_bytes()
+            ):
+                return  # another program has that number by now
+            browser = os.pidfd_open(pid)
+        except (OSError, ValueError, AttributeError):  # nothing is left, or this isn't Linux
+            return
+        try:
+            for number in (signal.SIGTERM, signal.SIGKILL):
+                signal.pidfd_send_signal(browser, number)
+                if select.select([browser], [], [], _CLOSING_S)[0]:
+                    return
+        except ProcessLookupError:
+            return
+        finally:
+            os.close(browser)
 
     def command(self, monitor: Monitor, address: str, *, name: str, token: str | None) -> list[str]:
         """Return the browser's command line."""

@@ -2,6 +2,8 @@
 
 import os
 import stat
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -64,6 +66,23 @@ def test_the_window_is_closed_behind_the_command(
         os.kill(pid, 0)  # it is there
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="only Linux tells whose profile it is")
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_window_that_a_killed_command_left_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ours: bool
+) -> None:
+    monkeypatch.setattr("backend.services.kiosk.shutil.which", lambda name: "/bin/true")
+    profile = tmp_path / "kiosk" / "profile"
+    profile.mkdir(parents=True)
+    words = f"--user-data-dir={profile if ours else 'elsewhere'}"
+    with subprocess.Popen([sys.executable, "-c", "input()", words], stdin=subprocess.PIPE) as left:
+        (profile / "SingletonLock").symlink_to(f"host-{left.pid}")
+        with Kiosk(tmp_path / "kiosk").opened(DESK, "http://127.0.0.1:1", name="wall", token="t"):
+            pass
+        assert (left.poll() is not None) == ours
+        left.kill()
 
 
 def test_without_a_browser_the_way_out_is_said(
