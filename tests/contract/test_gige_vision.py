@@ -1,6 +1,7 @@
 """GigE Vision for real: the Aravis driver against cameras that speak the protocol, over loopback."""
 
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import pytest
 
 from backend.devices.assembled import AssembledRig, SensorFacts
 from backend.devices.conformance import RigConformance
+from backend.devices.drivers import gige_link
 from backend.devices.drivers.aravis_camera import AravisCamera, AravisOptions
 from backend.devices.drivers.aravis_library import AravisMissingError, aravis
 from backend.devices.errors import (
@@ -22,8 +24,9 @@ from backend.devices.errors import (
     FeatureError,
     IncompleteFrame,
 )
+from backend.devices.peers import genicam as peer_features
 from backend.devices.peers.gige_camera import GigECamera, Wire
-from backend.devices.peers.gvcp import PORT, Command, ask, request
+from backend.devices.peers.gvcp import PORT, Bootstrap, Command, ask, request
 from backend.devices.protocols import LinkState, TriggerSource
 from backend.devices.sim import create_rig
 from backend.devices.sim.rig import SimulatedRig
@@ -81,6 +84,44 @@ def test_known_addresses_are_asked_one_by_one(addresses):
     )
 
 
+VIEWER_LEFT_ON = {
+    "TestPattern": (peer_features.TEST_PATTERN, (1).to_bytes(4), "its pictures are test images"),
+    "ReverseX": (peer_features.REVERSE_X, (1).to_bytes(4), "mirrored"),
+    "GammaEnable": (peer_features.GAMMA_ENABLE, (1).to_bytes(4), "aren't proportional"),
+    "AcquisitionFrameRateEnable": (peer_features.RATE_ENABLE, (1).to_bytes(4), "passed over"),
+}
+
+
+def test_what_a_viewer_left_on_is_switched_off_and_told(addresses):
+    """All of it at once: pictures are those of a camera that nobody has touched."""
+    with network(addresses) as (simulated, peers):
+        simulated.projector.blank(255)
+        with opened(addresses) as camera:
+            assert camera.notes == ()
+            camera.arm()
+            camera.trigger()
+            untouched = camera.get_frame().data.astype(float)
+        for register, value, _ in VIEWER_LEFT_ON.values():
+            peers[0]._registers.write(register.address, value)
+        peers[0]._registers.write(peer_features.GAMMA.address, struct.pack(">d", 0.45))
+        peers[0]._registers.write(peer_features.RATE.address, struct.pack(">d", 0.5))
+        ramp = peers[0]._processing.of(np.zeros((120, 160), np.uint8), 8)
+        assert ramp[0, 0] == 255, "it would do what it is set to"
+        with opened(addresses) as camera:
+            notes = camera.notes
+            camera.arm()
+            pictures = []
+            for _ in range(2):  # with a frame in two seconds the second one would be passed over
+                camera.trigger()
+                pictures.append(camera.get_frame(timeout_s=1.0).data.astype(float))
+            assert camera.remarks == ()
+    assert len(notes) == len(VIEWER_LEFT_ON)
+    for feature, (_, _, words) in VIEWER_LEFT_ON.items():
+        assert any(f"left: {feature} was" in n and words in n for n in notes), (feature, notes)
+    for picture in pictures:
+        assert abs(picture - untouched).mean() < 0.5 * abs(picture - untouched[:, ::-1]).mean()
+
+
 def test_nobody_at_the_address_is_one_sentence(addresses):
     camera = AravisCamera("left", AravisOptions(address=addresses[0]))
     with pytest.raises(DeviceNotFound, match=f"left: no camera answers at {addresses[0]}"):
@@ -133,6 +174,48 @@ def test_what_resending_cannot_save_is_an_incomplete_frame_and_the_next_one_is_w
         peers[0]._wire = Wire()
         camera.trigger()
         camera.get_frame()
+
+
+@pytest.mark.parametrize(
+    ("largest_bytes", "trigger", "sentence"),
+    [
+        (0, TriggerSource.SOFTWARE, "it answers commands, but no packet of its pictures arrives: let UDP .* through"),
+        (0, TriggerSource.FREE_RUN, "no packet of its pictures arrives"),
+        (0, TriggerSource.LINE1, "trigger one, or check the line"),
+    ],
+)  # fmt: skip
+def test_why_no_picture_arrives_is_said(addresses, largest_bytes, trigger, sentence):
+    wire = Wire(largest_bytes=largest_bytes)
+    with network(addresses, wire), opened(addresses, packet_bytes=8000) as camera:
+        camera.configure(replace(camera.settings, trigger=trigger))
+        camera.arm()
+        if trigger is TriggerSource.SOFTWARE:
+            camera.trigger()
+        with pytest.raises((DeviceTimeout, IncompleteFrame), match=sentence) as refused:
+            camera.get_frame(timeout_s=1.0)
+        assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("asked", [{}, {"packet_bytes": 8000}], ids=["found", "too large"])
+def test_packets_that_do_not_get_through_are_made_smaller(addresses, asked):
+    with network(addresses, Wire(largest_bytes=3000)) as (_, peers), opened(addresses, **asked) as camera:  # fmt: skip
+        camera.arm()
+        camera.trigger()
+        assert camera.get_frame().data.shape == (120, 160)
+        assert peers[0]._registers.read_number(Bootstrap.PACKET_SIZE) <= 3000
+
+
+def test_receive_buffers_that_are_too_small_are_told_with_the_command(
+    addresses, tmp_path, monkeypatch
+):
+    limit = tmp_path / "rmem_max"
+    monkeypatch.setattr(gige_link, "LARGEST_BUFFER", limit)
+    with network(addresses):
+        for text, remarks in (("8000\n", 1), ("212992\n", 0), ("", 0)):
+            limit.write_text(text)
+            with opened(addresses) as camera:
+                assert len(camera.remarks) == remarks, text
+                assert all("sudo sysctl -w net.core.rmem_max=" in r for r in camera.remarks)
 
 
 def test_a_trigger_during_an_exposure_is_lost(addresses):

@@ -5,13 +5,14 @@ Nothing is ever broadcast here but by `search`: that is discovery, and only done
 """
 
 import ctypes
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 from pydantic import model_validator
 
+from backend.devices.drivers import gige_link
 from backend.devices.drivers.aravis_library import (
     Aravis,
     AravisError,
@@ -38,10 +39,9 @@ from backend.devices.protocols import (
     DeviceInfo,
     Frame,
     LinkState,
+    TriggerSource,
 )
 
-_SOCKET_BUFFER_BYTES = 8 << 20
-"""Aravis leaves it at the kernel's default, in which a burst of packets doesn't find room."""
 _RETENTION_US = 400_000
 """How long a frame waits for packets: Aravis' 100 ms are too few for a machine that is busy."""
 _FEWEST_BUFFERS = 4
@@ -95,6 +95,8 @@ class AravisCamera(SfncCamera):
         """Addresses of GObjects; 0: there is none."""
         self._lost_callback: object = None
         self._counter = FrameCounter()
+        self._whole_frames = self._broken_frames = 0
+        """Since acquisition was started."""
 
     # ------------------------------------------------------------ life
 
@@ -107,6 +109,7 @@ class AravisCamera(SfncCamera):
         features = AravisFeatures(self._camera)
         self._prepare(features, hardware_timestamp=True)
         self._set_packet_size(library)
+        self._remarks = (*self._remarks, *self._small_buffer())
         return self._who(features), self._controls.capabilities(), self._controls.read()
 
     def _library(self) -> Aravis:
@@ -140,9 +143,11 @@ class AravisCamera(SfncCamera):
             return DeviceBusy(
                 self.name, f"another program controls the camera {where}; close it there"
             )
-        return DeviceNotFound(
-            self.name, f"no camera answers {where}; check cable, power and the rig's file"
-        )
+        cure = "check cable, power and the rig's file"
+        if address:
+            elsewhere = gige_link.wrong_network(address, gige_link.content_of(gige_link.ROUTES))
+            cure = elsewhere or cure
+        return DeviceNotFound(self.name, f"no camera answers {where}; {cure}")
 
     def _note_loss(self) -> None:
         """Notice, on a thread of Aravis, that control is gone."""
@@ -180,6 +185,15 @@ class AravisCamera(SfncCamera):
         else:
             self._call("arv_camera_gv_set_packet_size", self._options.packet_bytes)
 
+    def _small_buffer(self) -> Iterator[str]:
+        """Say that the computer's receive buffers are too small for a frame."""
+        allowed = gige_link.content_of(gige_link.LARGEST_BUFFER).strip()
+        if self._options.address and allowed.isdecimal():
+            payload = int(self._call("arv_camera_get_payload"))
+            problem = gige_link.small_buffer(payload, int(allowed))
+            if problem:
+                yield f"{self.name}: {problem}."
+
     # ------------------------------------------------------------ settings and frames
 
     def _start(self, n_frames: int | None) -> None:
@@ -198,12 +212,38 @@ class AravisCamera(SfncCamera):
             raise AravisError("arv-device-error-quark", 0, "no stream was made")
         self._stream = int(stream)
         if library.plain("arv_camera_is_gv_device", self._camera):
-            library.set_number_property(self._stream, b"socket-buffer-size", _SOCKET_BUFFER_BYTES)
+            library.set_number_property(
+                self._stream, b"socket-buffer-size", gige_link.WANTED_BUFFER_BYTES
+            )
             library.set_number_property(self._stream, b"frame-retention", _RETENTION_US)
         for _ in range(count):
             buffer = library.plain("arv_buffer_new_allocate", payload)
             library.plain("arv_stream_push_buffer", self._stream, buffer)
         self._counter.restart()
+        self._whole_frames = self._broken_frames = 0
+
+    @property
+    def _cure(self) -> str:
+        """What to do when no frame comes."""
+        waits_for_line = self._settings.trigger not in (
+            TriggerSource.SOFTWARE,
+            TriggerSource.FREE_RUN,
+        )
+        fired = self._due_at_s > 0 or self._settings.trigger is TriggerSource.FREE_RUN
+        trouble = "" if waits_for_line or not fired else self._stream_trouble()
+        return trouble or super()._cure
+
+    def _stream_trouble(self) -> str:
+        """Say what is known of a stream that brings no picture; empty: nothing, or it isn't on a network."""
+        library = aravis()
+        if not (self._options.address and self._stream):
+            return ""
+        packets = library.plain(
+            "arv_stream_get_info_uint64_by_name", self._stream, b"n_received_packets"
+        )
+        counts = gige_link.StreamCounts(int(packets), self._whole_frames, self._broken_frames)
+        packet_bytes = int(self._call("arv_camera_gv_get_packet_size"))
+        return gige_link.stream_trouble(counts, packet_bytes, self._options.address)
 
     def _stop(self) -> None:
         self._call("arv_camera_stop_acquisition")
@@ -228,9 +268,10 @@ class AravisCamera(SfncCamera):
                     if status == _TIMED_OUT
                     else "arrived with packets missing"
                 )
-                raise IncompleteFrame(
-                    self.name, f"frame {number} {what} (status {status}); take it again"
-                )
+                self._broken_frames += 1
+                cure = self._stream_trouble() or "take it again"
+                raise IncompleteFrame(self.name, f"frame {number} {what} (status {status}); {cure}")
+            self._whole_frames += 1
             return self._frame(buffer, number)
         finally:
             library.plain("arv_stream_push_buffer", self._stream, buffer)

@@ -86,6 +86,7 @@ _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_camera_start_acquisition": (None, (_POINTER,)),
     "arv_camera_stop_acquisition": (None, (_POINTER,)),
     "arv_camera_gv_set_packet_size": (None, (_POINTER, _INT)),
+    "arv_camera_gv_get_packet_size": (_UINT, (_POINTER,)),
     "arv_camera_gv_auto_packet_size": (_UINT, (_POINTER,)),
 }  # fmt: skip
 _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -107,6 +108,7 @@ _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_buffer_get_frame_id": (_ULONG, (_POINTER,)),
     "arv_buffer_get_image_width": (_INT, (_POINTER,)),
     "arv_buffer_get_image_height": (_INT, (_POINTER,)),
+    "arv_stream_get_info_uint64_by_name": (_ULONG, (_POINTER, _TEXT)),
     "arv_stream_push_buffer": (None, (_POINTER, _POINTER)),
     "arv_stream_timeout_pop_buffer": (_POINTER, (_POINTER, _ULONG)),
     "arv_stream_try_pop_buffer": (_POINTER, (_POINTER,)),

@@ -45,6 +45,8 @@ _TICKS_PER_S = 1_000_000_000
 _KEPT_BLOCKS = 8
 """Frames that can still be resent."""
 _POLL_S = 0.1
+_HEADERS_BYTES = 28
+"""IPv4's and UDP's, which count as a part of a packet."""
 _TEST_PACKET = 0x8000_0000
 """Bit of the packet size register that asks for a packet of that size."""
 
@@ -59,6 +61,8 @@ class Wire:
     """After so many packets the sender pauses, so that small receive buffers keep up."""
     pause_s: float = 0.0002
     seed: int = 0
+    largest_bytes: int | None = None
+    """Longer packets never arrive, as at a switch without jumbo frames; 0: none does, as at a firewall."""
 
 
 class GigECamera:
@@ -309,7 +313,7 @@ class GigECamera:
             raise RefusedError(Status.INVALID_PARAMETER)
         self._registers.number(Bootstrap.PACKET_SIZE, value & ~_TEST_PACKET)
         if value & _TEST_PACKET:
-            self._send(bytes(size - 28), self._destination())  # less the IPv4 and UDP headers
+            self._send(bytes(size - _HEADERS_BYTES), self._destination())
 
     # ------------------------------------------------------------ commands
 
@@ -502,7 +506,8 @@ class GigECamera:
         return socket.inet_ntoa(address), port
 
     def _send(self, packet: bytes, destination: tuple[str, int]) -> None:
-        if destination[1] == 0:
+        largest = self._wire.largest_bytes
+        if destination[1] == 0 or (largest is not None and len(packet) + _HEADERS_BYTES > largest):
             return
         try:
             self._stream.sendto(packet, destination)
