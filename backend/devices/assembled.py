@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from backend.devices.dlpc350_protocol import COLUMN_PITCH_BY_ROW_PITCH
 from backend.devices.errors import RigConfigError
 from backend.devices.opening import open_all
 from backend.devices.protocols import (
@@ -14,6 +15,8 @@ from backend.devices.protocols import (
     TriggerSource,
 )
 from backend.domain.rig import CameraFacts, ProjectorFacts, RigCalibration, RigFacts
+
+_PITCH_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,7 @@ class AssembledRig:
     def facts(self) -> RigFacts:
         """Return sizes and ranges as the devices tell them, noise as the rig's owner measured it."""
         self._refuse_other_sizes()
+        self._refuse_square_pixels()
         cameras = {name: self._camera_facts(name) for name in self._cameras}
         can = self._projector.capabilities
         # A pattern of a sequence is complete within the exposure, whatever that is: no grid is needed.
@@ -161,6 +165,19 @@ class AssembledRig:
                     f"{name}: the calibration is for {width}x{height} px, the device has {now_width}x{now_height};"
                     " calibrate it at the size in use, or use it at the size it was calibrated at"
                 )
+
+    def _refuse_square_pixels(self) -> None:
+        """Refuse the calibration of a projector for pixels that it hasn't: points from it would be stretched."""
+        model = self._calibration.projector if self._calibration else None
+        if model is None or self._projector.capabilities.pixel_layout != "diamond":
+            return
+        ratio = float(model.K[1, 1] / model.K[0, 0])
+        if abs(ratio / COLUMN_PITCH_BY_ROW_PITCH - 1.0) > _PITCH_TOLERANCE:
+            raise RigConfigError(
+                f"{self._projector.name}: the calibration has focal lengths of {model.K[0, 0]:.0f} columns and"
+                f" {model.K[1, 1]:.0f} rows, but its columns are twice as far apart as its rows; calibrate it with patterns"
+                " of its own size"
+            )
 
     def _camera_facts(self, name: str) -> CameraFacts:
         can, sensor = self._cameras[name].capabilities, self._sensors[name]

@@ -18,6 +18,11 @@ VENDOR_ID, PRODUCT_ID = 0x0451, 0x6401
 SIZE_PX = (912, 1140)
 """The chip's mirrors: columns and rows, rotated by 45 degrees, every second row half a column further."""
 
+COLUMN_PITCH_BY_ROW_PITCH = 2.0
+"""Columns are so many times as far apart as rows."""
+SHOW_PERIOD_US = 8333
+"""Of a single pattern that is shown until the next, unless a rig file says another one."""
+
 MOST_PATTERNS = 128
 """Entries of the table of patterns."""
 MOST_IMAGES = 64

@@ -9,6 +9,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict
 
 from backend.devices.calibration_entries import CalibrationEntry
+from backend.devices.dlpc350_protocol import SHOW_PERIOD_US, SIZE_PX
 from backend.devices.errors import RigConfigError, RigNotFoundError
 from backend.devices.loading import available_rigs, open_rig
 from backend.devices.options import DisplaySize
@@ -24,8 +25,6 @@ LATENCY_SUFFIX = ".latency.json"
 """Beside a rig's file: what the latency calibration found."""
 ASSUMED_REFRESH_HZ = 60.0
 """Of a display that tells no refresh rate."""
-_OF_ONE_SIZE = {"dlpc350"}
-"""Drivers of a single kind of projector: their entries needn't say its size."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,40}")
 
 
@@ -66,6 +65,13 @@ def _same_mode(known: KnownLatency, said: Mapping[str, object], *, measures_itse
     if measures_itself and said.get("refresh_hz") is None:
         return known.size == now.size
     return known.mode == now.mode
+
+
+def _rate_of(said: Mapping[str, object], known: KnownLatency) -> float:
+    """Return the rate at which a LightCrafter repeats a single pattern, as it was measured where it is the same."""
+    period_us = float(str(said.get("show_period_us", SHOW_PERIOD_US)))
+    measured_hz = known.refresh_hz or ASSUMED_REFRESH_HZ
+    return measured_hz if abs(1e6 / measured_hz - period_us) < 0.5 else 1e6 / period_us
 
 
 class RigShelf:
@@ -163,8 +169,8 @@ class RigShelf:
             text = self._latency_path(name).read_text("utf-8")
             known = KnownLatency.model_validate_json(text)
             said = dict(file.projector.model_extra or {})
-            if file.projector.driver in _OF_ONE_SIZE:
-                said = {"size": known.size, "refresh_hz": known.refresh_hz, **said}
+            if file.projector.driver == "dlpc350":
+                said = {"size": SIZE_PX, "refresh_hz": _rate_of(said, known), **said}
             same = _same_mode(known, said, measures_itself=file.projector.driver == "page")
         except (OSError, ValueError):
             return file

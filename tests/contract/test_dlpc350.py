@@ -37,6 +37,7 @@ from backend.devices.peers.dlpc350 import SimulatedDlpc350, load_ms
 from backend.devices.protocols import Frame, LinkState, Rig, SequenceProjector, TriggerSource
 from backend.devices.rig_shelf import RigShelf
 from backend.domain.patterns import Gray, Sine, Uniform
+from backend.domain.rig import PinholeModel, Pose, RigCalibration
 from backend.jobs.rendering import render
 from tests.lightcrafter_hardware import lightcrafter_hardware
 
@@ -231,7 +232,7 @@ def test_images_that_load_too_slowly_are_refused_with_the_period_that_works(tmp_
     with SimulatedDlpc350(Bench(), flash) as device, projector_of(device, tmp_path) as projector:
         projector.load(pictures)
         projector.arm_sequence(range(6), 16_667, 16_667)  # two images are in memory beforehand
-        with pytest.raises(FeatureError, match=r"image 1 takes 200 ms .* for 66\.7 ms or longer"):
+        with pytest.raises(FeatureError, match=r"image 2 takes 200 ms .* for 66\.7 ms or longer"):
             projector.arm_sequence(range(9), 16_667, 16_667)
         projector.arm_sequence(range(9), 66_667, 66_667)
 
@@ -631,6 +632,46 @@ def test_a_measured_latency_is_waited_for(tmp_path, folder):
     kept = {"size": [WIDTH, HEIGHT], "refresh_hz": 120.0048, "settle_ms": 25.0}
     (tmp_path / "bench.latency.json").write_text(json.dumps(kept))
     assert _settle_ms(shelf) == 25.0
+    text = (tmp_path / "bench.yaml").read_text()
+    for period_us, holds in ((8333, True), (16_667, False), (8334, False)):
+        other = text.replace("driver: dlpc350,", f"driver: dlpc350, show_period_us: {period_us},")
+        (tmp_path / "bench.yaml").write_text(other)
+        assert _settle_ms(shelf) == (25.0 if holds else None), "measured with another period"
+
+
+@pytest.mark.parametrize(("rows", "refused"), [(3000.0, False), (1500.0, True)])
+def test_a_projector_model_for_square_pixels_is_refused(projector, rows, refused):
+    K = np.array([[1500.0, 0, WIDTH / 2], [0, rows, HEIGHT / 2], [0, 0, 1]])
+    model = PinholeModel(WIDTH, HEIGHT, K, np.zeros(5))
+    known = RigCalibration(
+        {}, {}, "left", projector=model, projector_from_world=Pose(np.eye(3), np.zeros(3))
+    )
+    rig = AssembledRig("bench", {}, projector, sensors={}, calibration=known)
+    if refused:
+        with pytest.raises(RigConfigError, match="its columns are twice as far apart as its rows"):
+            rig._refuse_square_pixels()
+    else:
+        rig._refuse_square_pixels()
+
+
+def test_a_later_image_is_loaded_while_the_one_before_it_is_shown(tmp_path):
+    """Of four images the second is there from the beginning, however shortly the first one is shown."""
+    random = np.random.default_rng(1)
+    noise = [random.integers(0, 256, (HEIGHT, WIDTH), np.uint8) for _ in range(3)]
+    pictures = [*noise, *(even(level) for level in range(6))]
+    write_set(tmp_path, [NewPattern(p, "mixed") for p in pictures], pack=True)
+    flash = PatternSet.read(tmp_path).image_pictures(tmp_path)
+    assert [round(load_ms(image)) for image in flash] == [200, 0, 0]
+    bench = Bench()
+    with SimulatedDlpc350(bench, flash) as device, projector_of(device, tmp_path) as projector:
+        projector.load(pictures)
+        for order in ([3, 4, 5, 0, 1, 2, 6, 7, 8], [0, 1, 2, 3, 4, 5, 6, 7, 8]):
+            projector.arm_sequence(order, 16_667, 16_667)
+            projector.start_sequence()
+            ran(device)
+        assert device.late_images == 0
+        with pytest.raises(FeatureError, match="image 0 takes 200 ms"):
+            projector.arm_sequence([3, 4, 5, 6, 7, 8, 0, 1, 2], 16_667, 16_667)
 
 
 def _settle_ms(shelf: RigShelf) -> float | None:

@@ -80,7 +80,7 @@ class Dlpc350Options(DeviceOptions):
     leds: Literal["white", "red", "green", "blue"] = "white"
     led_currents: tuple[int, int, int] | None = None
     """Red, green, blue, 0 to 255 (most); None leaves them alone. Too much destroys the LEDs: see TI's guide."""
-    show_period_us: int = Field(8333, ge=235, le=2_000_000)
+    show_period_us: int = Field(protocol.SHOW_PERIOD_US, ge=235, le=2_000_000)
     """Period of a single pattern that is shown until the next: exposures should be multiples of it."""
     settle_ms: float | None = Field(None, ge=0, le=10_000)
     """From the start of a single pattern, its image being loaded, to its light, as the latency calibration found it;
@@ -164,6 +164,14 @@ class Dlpc350Projector(Link):
         self._stop = threading.Event()
         self._duration_s: float | None = None
         self.settle_ms = options.settle_ms
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Say what its mirrors mean for who decodes columns."""
+        return (
+            f"{self.name}: its mirrors stand on their corners: columns are twice as far apart as rows, and every second row"
+            " stands half a column further; decoded columns are a quarter of one off there, to either side.",
+        )
 
     @property
     def capabilities(self) -> ProjectorCapabilities:
@@ -388,7 +396,9 @@ class Dlpc350Projector(Link):
         """
         if len(run.images) <= protocol.PRELOADED_IMAGES:
             return
-        for image, shown in zip(run.images[1:], run.shown, strict=False):
+        preloaded = protocol.PRELOADED_IMAGES
+        # While an image is shown, the next one but none further is loaded.
+        for image, shown in zip(run.images[preloaded:], run.shown[preloaded - 1 :], strict=False):
             least_us = self._loading_ms(image) * 1000.0 / shown
             if period_us < least_us:
                 raise FeatureError(
