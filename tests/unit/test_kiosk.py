@@ -77,7 +77,10 @@ def test_a_window_that_a_killed_command_left_is_closed(
     profile = tmp_path / "kiosk" / "profile"
     profile.mkdir(parents=True)
     words = f"--user-data-dir={profile if ours else 'elsewhere'}"
-    with subprocess.Popen([sys.executable, "-c", "input()", words], stdin=subprocess.PIPE) as left:
+    command = [sys.executable, "-c", "print(1, flush=True); input()", words]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as left:
+        assert left.stdout is not None
+        left.stdout.readline()  # it runs, under these words
         (profile / "SingletonLock").symlink_to(f"host-{left.pid}")
         with Kiosk(tmp_path / "kiosk").opened(DESK, "http://127.0.0.1:1", name="wall", token="t"):
             pass
