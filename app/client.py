@@ -33,6 +33,7 @@ from backend.contract.rigs import (
     LatencyView,
     LiveSettings,
     LiveView,
+    PartView,
     RigOffer,
     RigState,
     RigView,
@@ -55,6 +56,7 @@ _RIGS: TypeAdapter[tuple[RigOffer, ...]] = TypeAdapter(tuple[RigOffer, ...])
 _RIG = TypeAdapter(RigView)
 _RIG_STATE = TypeAdapter(RigState)
 _LIVE = TypeAdapter(LiveView)
+_PART: TypeAdapter[PartView | None] = TypeAdapter(PartView | None)
 _LATENCY: TypeAdapter[LatencyView | None] = TypeAdapter(LatencyView | None)
 _DISCOVERY = TypeAdapter(Discovery)
 _SCANS: TypeAdapter[tuple[ScanSummary, ...]] = TypeAdapter(tuple[ScanSummary, ...])
@@ -175,6 +177,13 @@ class ApiClient:
         """Return a square part of the newest picture of a camera, pixel by pixel; None if there is none."""
         query = {"x": x, "y": y, "part_px": size_px, "marks": marks}
         return self._picture(f"/api/rigs/{quote(rig)}/cameras/{quote(camera)}/preview", query)
+
+    def part_numbers(
+        self, rig: str, camera: str, x: int, y: int, *, size_px: int
+    ) -> PartView | None:
+        """Tell how bright and how sharp a square part of the newest picture is; None if there is none."""
+        query = {"x": x, "y": y, "part_px": size_px}
+        return self._get(f"/api/rigs/{quote(rig)}/cameras/{quote(camera)}/part", _PART, query)
 
     # ---- a rig without a scan
 

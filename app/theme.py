@@ -166,7 +166,9 @@ div:has(> i.ug-bare) + div { padding-block: 2px 14px !important; }
 .ug-live-card { margin: 2px 12px 8px; }
 .ug-live-head { display: flex; justify-content: space-between; align-items: baseline; font-size: 12.5px; }
 .ug-live-head .ug-name { color: var(--ug-text); font-weight: 600; } .ug-live-head i { display: inline-block; width: 10px; height: 10px; border-radius: 2px; margin-right: 7px; }
-.ug-shares { display: flex; justify-content: space-between; font-size: 12px; color: var(--ug-dim); margin: 2px 0 1px; font-variant-numeric: tabular-nums; } .ug-shares b { font-weight: 500; color: var(--ug-text); }
+.ug-shares { display: flex; justify-content: space-between; font-size: 12px; color: var(--ug-dim); margin: 2px 0 1px; font-variant-numeric: tabular-nums; } .ug-shares b { font-weight: 500; color: var(--ug-text); } .ug-shares i { display: inline-block; width: 7px; height: 7px; border-radius: 1px; margin-right: 5px; vertical-align: 1px; }
+.ug-late { color: var(--ug-amber); }
+.ug-rig-title { display: -webkit-box; -webkit-line-clamp: 2; -webkit-box-orient: vertical; overflow: hidden; white-space: normal; overflow-wrap: anywhere; }
 .ug-sharp { display: flex; align-items: center; gap: 8px; font-size: 12px; color: var(--ug-dim); } .ug-sharp .ug-progress { flex: 1; margin: 0; } .ug-sharp .ug-value { min-width: 88px; text-align: right; color: var(--ug-text); font-variant-numeric: tabular-nums; }
 .ug-live-foot { display: flex; justify-content: space-between; align-items: baseline; padding: 0 12px 6px; }
 .ug-work { margin: 2px 12px 8px; } .ug-work .ug-ends { gap: 12px; } .ug-work .ug-ends span:last-child { white-space: nowrap; }

@@ -179,9 +179,10 @@ class RigDeskPanel:
             cameras = [
                 (d.name, d.width_px, d.height_px) for d in state.devices if d.role == "camera"
             ]
-            if cameras:
-                self._planes.arrange(cameras)
-            elif state.link is RigLink.CLOSED:
+            if cameras and self._planes.arrange(cameras):
+                self._numbers = {}  # pictures that stood elsewhere are drawn again
+                self._focus.mark_again()
+            elif not cameras and state.link is RigLink.CLOSED:
                 self._planes.clear()
                 self._numbers = {}
 
@@ -206,8 +207,9 @@ class RigDeskPanel:
         return [d.name for d in devices if d.role == "camera"]
 
     def _head_html(self, state: RigState) -> str:
-        title = markup.div("ug-title", markup.esc(state.title))
-        below = markup.div("ug-subtitle", markup.esc(_purpose(state)))
+        title = markup.div("ug-title ug-rig-title", markup.esc(state.title), title=state.title)
+        purpose = _purpose(state)
+        below = markup.div("ug-subtitle", markup.esc(purpose), title=purpose)
         back = ""
         if self._desk.who.may_operate:
             back = self._desk.clicks.label(

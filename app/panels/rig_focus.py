@@ -11,12 +11,14 @@ from app.numbers import percent, quantity
 from app.views.levels import LevelsChart, camera_colour
 from app.views.live_planes import LivePlanes
 from app.views.pixel import decoded
-from backend.contract.rigs import LiveCamera, LiveView
+from app.views.sharpness import SharpnessAid
+from backend.contract.rigs import LiveCamera, LiveView, PartView
 
 _PART_PX = 128
 _MAGNIFIED = 3
-_PANEL_PX = (300, 350)
-_IN_A_ROW = 3
+_PANEL_PX = (300, 410)
+_RED, _BLUE = "#e23030", "#3f86ff"
+"""As pixels are marked in the pictures."""
 _OLD_S = 2.0
 """A picture older than that, beyond twice its exposure, isn't live any more."""
 
@@ -31,15 +33,16 @@ class FocusPanel:
         gui.add_html(markup.div("ug-heading", "Gray levels"))
         self._chart = LevelsChart(gui)
         self._cards = gui.add_html("")
-        self._lately: dict[str, dict[int, float]] = {}
-        """Of each camera: sharpness by the number of the picture."""
-        self._best: dict[str, float] = {}
+        self._aids: dict[str, SharpnessAid] = {}
+        """One per camera."""
+        self._part_aid = SharpnessAid()
         self._pattern = ""
         self._place: tuple[str, int, int] | None = None
         self._part: Any = None
         self._panel = gui.add_panel(visible=False)
         with self._panel.add_tab("Magnifier", viser.Icon.ZOOM_IN):
             self._part_head = gui.add_html("")
+            self._part_numbers = gui.add_html("")  # above the picture: never cut off
             self._part_place = gui.add_folder(None)
         self._panel.float(x=-14, y=-14, width=_PANEL_PX[0], height=_PANEL_PX[1])
         del client
@@ -56,7 +59,9 @@ class FocusPanel:
             self._pattern = live.settings.pattern
             self._start_anew()
         for camera in live.cameras:
-            self._remember(camera)
+            self._aid(camera.camera).note(camera.number, camera.sharpness, camera.saturated_share)
+        if not cameras:
+            self._chart.clear()
         self._chart.show(cameras, {c.camera: c.histogram for c in live.cameras})
         known = {c.camera: c for c in live.cameras}
         content = "".join(self._card(i, name, known.get(name)) for i, name in enumerate(cameras))
@@ -67,6 +72,7 @@ class FocusPanel:
     def choose(self, camera: str, x: int, y: int) -> None:
         """Show this part of a picture pixel by pixel from now on."""
         self._place = camera, x, y
+        self._part_aid = SharpnessAid()
         self._planes.mark(camera, x, y, _PART_PX)
         close = self._desk.clicks.label(
             "leave part", self._put_away, "✕ close", "ug-link", "Put it away"
@@ -74,6 +80,11 @@ class FocusPanel:
         title = markup.span("ug-name", markup.esc(f"{camera}, pixel {x}, {y}"))
         self._part_head.content = markup.div("ug-caption ug-pixel", title + close)
         self._panel.visible = True
+
+    def mark_again(self) -> None:
+        """Draw the square around the part: the pictures stand elsewhere now."""
+        if self._place is not None:
+            self._planes.mark(*self._place, _PART_PX)
 
     def look(self, rig: str, camera: LiveCamera, *, marks: bool) -> None:
         """Fetch the chosen part of a new picture."""
@@ -89,19 +100,29 @@ class FocusPanel:
                 self._part = self._gui.add_image(part, format="jpeg", jpeg_quality=90)
         else:
             self._part.image = part
+        numbers = self._desk.api.part_numbers(rig, *place, size_px=_PART_PX)
+        if numbers is not None and self._place == place:
+            self._show_numbers(numbers, camera.bit_depth)
+
+    def _show_numbers(self, numbers: PartView, bit_depth: int) -> None:
+        self._part_aid.note(numbers.number, numbers.sharpness, numbers.saturated_share)
+        cells = (
+            _mean(numbers.mean_gray, bit_depth),
+            _share("saturated", numbers.saturated_share, _RED),
+        )
+        self._part_numbers.content = markup.div(
+            "ug-live-card", markup.div("ug-shares", "".join(cells)) + self._part_aid.html()
+        )
 
     def _start_anew(self) -> None:
-        self._lately, self._best = {}, {}
+        self._aids, self._part_aid = {}, SharpnessAid()
 
-    def _remember(self, camera: LiveCamera) -> None:
-        """Keep the best sharpness: of three pictures in a row the middle one counts, so no single one does."""
-        lately = self._lately.setdefault(camera.camera, {})
-        lately[camera.number] = camera.sharpness
-        for old in sorted(lately)[:-_IN_A_ROW]:
-            del lately[old]
-        if len(lately) == _IN_A_ROW:
-            now = float(np.median(list(lately.values())))
-            self._best[camera.camera] = max(self._best.get(camera.camera, 0.0), now)
+    def _reset_best(self) -> None:
+        for aid in (*self._aids.values(), self._part_aid):
+            aid.forget_best()
+
+    def _aid(self, camera: str) -> SharpnessAid:
+        return self._aids.setdefault(camera, SharpnessAid())
 
     def _put_away(self) -> None:
         self._place = None
@@ -117,36 +138,21 @@ class FocusPanel:
         exposure = quantity(camera.exposure_ms, "ms") if camera.exposure_ms else ""
         gain = quantity(camera.gain_db, "dB", 3) if camera.gain_db else ""
         old = camera.age_s > _OLD_S + 2e-3 * (camera.exposure_ms or 0.0)
-        age = f"{camera.age_s:.0f} s old" if old else ""
-        note = " · ".join(t for t in (exposure, gain, age) if t)
-        head = markup.span("ug-name", swatch + markup.esc(name)) + markup.span(
-            "ug-note", markup.esc(note)
-        )
+        age = markup.span("ug-late", f"{camera.age_s:.0f} s old") if old else ""
+        note = " · ".join(t for t in (markup.esc(exposure), markup.esc(gain), age) if t)
+        head = markup.span("ug-name", swatch + markup.esc(name)) + markup.span("ug-note", note)
         return markup.div(
             "ug-live-card",
-            markup.div("ug-live-head", head) + _shares(camera) + self._sharpness(camera),
+            markup.div("ug-live-head", head) + _shares(camera) + self._aid(name).html(),
         )
-
-    def _sharpness(self, camera: LiveCamera) -> str:
-        best = self._best.get(camera.camera, 0.0)
-        now = float(np.median(list(self._lately.get(camera.camera, {0: 0.0}).values())))
-        share = max(0.0, now / best) if best > 0 else 0.0
-        colour = "#3fae6a" if share >= 0.95 else "#e8a33d" if share >= 0.7 else "#e25555"
-        bar = f'<div class="ug-progress"><div style="width:{100 * share:.0f}%;background:{colour}"></div></div>'
-        words = (
-            markup.span("", "sharpness")
-            + bar
-            + markup.span("ug-value", f"{100 * share:.0f} % of best")
-        )
-        return markup.div("ug-sharp", words)
 
     def _foot(self) -> str:
-        hint = "Click a picture to magnify a part."
+        hint = "Click a picture to focus on a part of it."
         if not self._desk.who.may_operate:
             return ""
         reset = self._desk.clicks.label(
             "reset best",
-            self._best.clear,
+            self._reset_best,
             "reset best",
             "ug-link",
             "Start the focus aid anew",
@@ -156,12 +162,19 @@ class FocusPanel:
 
 def _shares(camera: LiveCamera) -> str:
     cells = (
-        ("mean", f"{camera.mean_gray:.0f} of {2**camera.bit_depth - 1}", ""),
-        ("saturated", percent(camera.saturated_share), "#e23030" if camera.saturated_share > 0 else ""),
-        ("black", percent(camera.black_share), "#3f86ff" if camera.black_share > 0 else ""),
-    )  # fmt: skip
-    inner = "".join(
-        f'<span>{name} <b style="color:{colour or "inherit"}">{markup.esc(value)}</b></span>'
-        for name, value, colour in cells
+        _mean(camera.mean_gray, camera.bit_depth),
+        _share("saturated", camera.saturated_share, _RED),
+        _share("black", camera.black_share, _BLUE),
     )
-    return markup.div("ug-shares", inner)
+    return markup.div("ug-shares", "".join(cells))
+
+
+def _mean(mean_gray: float, bit_depth: int) -> str:
+    return f"<span>mean <b>{mean_gray:.0f} of {2**bit_depth - 1}</b></span>"
+
+
+def _share(name: str, share: float, colour: str) -> str:
+    """Return a share with the colour that its pixels have in the picture."""
+    shown = f"color:{colour}" if share > 0 else ""
+    mark = f'<i style="background:{colour}"></i>'
+    return f'<span>{mark}{name} <b style="{shown}">{markup.esc(percent(share))}</b></span>'

@@ -18,6 +18,8 @@ Array = NDArray[Any]
 _NODE = "/live"
 _WIDTH = 10.0
 _GAP = 0.5
+_ALIKE = 0.05
+"""Windows whose aspect differs by less show the same arrangement."""
 _UPRIGHT = viser.transforms.SO3.from_matrix(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])).wxyz
 
 
@@ -40,6 +42,8 @@ class LivePlanes:
         self._pictures: dict[str, viser.ImageHandle] = {}
         self._others: dict[str, Any] = {}
         self._pose: tuple[Any, Any] | None = None
+        self._aspect = 1.0
+        """Of the window that the pictures were arranged for."""
 
     @property
     def is_open(self) -> bool:
@@ -66,14 +70,19 @@ class LivePlanes:
             node.remove()
         self._pictures, self._others, self._seats = {}, {}, {}
 
-    def arrange(self, cameras: Sequence[tuple[str, int, int]]) -> None:
-        """Make room for pictures: name, width and height in [px] of each camera."""
+    def arrange(self, cameras: Sequence[tuple[str, int, int]]) -> bool:
+        """Make room for pictures: name, width and height in [px] of each camera.
+
+        Returns whether there was another arrangement before, or none: it is empty now.
+        """
         wanted = {name: (width, height) for name, width, height in cameras}
-        if wanted == {name: seat.size_px for name, seat in self._seats.items()}:
-            return
-        self.clear()
         camera = self._space.client.camera
         aspect = max(camera.aspect or 1.0, 0.2)
+        is_same_window = abs(aspect / self._aspect - 1.0) < _ALIKE
+        if is_same_window and wanted == {n: seat.size_px for n, seat in self._seats.items()}:
+            return False
+        self.clear()
+        self._aspect = aspect
         self._seats, extent = _seated(cameras, aspect)
         for order, (name, seat) in enumerate(self._seats.items()):
             self._frame(name, seat, order)
@@ -81,6 +90,7 @@ class LivePlanes:
         self._space.set_pose(
             np.array([0.0, -half / np.tan(camera.fov / 2), 0.0]), np.array([0.0, 0.0, 0.0])
         )
+        return True
 
     def show(self, name: str, picture_rgb: Array) -> None:
         """Show the newest picture of a camera."""

@@ -18,6 +18,7 @@ from backend.contract.rigs import (
     LatencyView,
     LiveSettings,
     LiveView,
+    PartView,
     RigOffer,
     RigState,
     RigView,
@@ -71,6 +72,19 @@ def camera_preview(
     return (
         Response(status_code=204) if picture is None else Response(picture, media_type="image/jpeg")
     )
+
+
+@router.get("/rigs/{rig}/cameras/{camera}/part")
+def camera_part(
+    rig: RigName,
+    camera: Annotated[str, Path(max_length=100)],
+    services: Uses,
+    x: Annotated[int, Query(ge=0, description="Column of the middle of the part.")],
+    y: Annotated[int, Query(ge=0, description="Its row.")],
+    part_px: Annotated[int, Query(ge=16, le=1024, description="Its width and height.")] = 160,
+) -> PartView | None:
+    """Tell brightness and sharpness of a part of the newest picture of a camera; null while there is none."""
+    return services.live_part(rig, camera, Crop(x, y, part_px))
 
 
 # ---- a rig without a scan

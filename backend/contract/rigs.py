@@ -172,6 +172,18 @@ class LiveCamera(Message):
     """Comparable only between pictures of the same scene under the same pattern; exposure doesn't matter."""
 
 
+class PartView(Message):
+    """What a square part of the newest picture of a camera says."""
+
+    number: int
+    """Of the picture, as in `LiveCamera`."""
+    mean_gray: float
+    saturated_share: float
+    """Of the part's pixels, in [0, 1]."""
+    sharpness: float
+    """Comparable only between pictures of the same place under the same pattern; exposure doesn't matter."""
+
+
 class LiveView(Message):
     """The newest pictures of a rig in numbers."""
 

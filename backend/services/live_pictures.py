@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from backend.contract.rigs import PartView
 from backend.domain.errors import NotFoundError
-from backend.numerics.live_numbers import mark_extremes
+from backend.numerics.live_numbers import live_numbers, mark_extremes
 from backend.services.context import Context
 from backend.services.previews import draw, encoded
 
@@ -68,6 +69,26 @@ def live_frame(
     key = ("live", rig, camera, picture.number, max_px, marks, crop)
     return context.previews.get(
         key, lambda: live_jpeg(picture.gray, picture.bit_depth, max_px, marks=marks, crop=crop)
+    )
+
+
+def live_part(context: Context, rig: str, camera: str, crop: Crop) -> PartView | None:
+    """Tell what a part of the newest picture of a camera says, None if there is none; never waits for a device."""
+    picture = context.rigs.live(rig, camera)
+    if picture is None:
+        return None
+    facts = context.rigs.status(rig).facts
+    known = facts.cameras.get(camera) if facts else None
+    found = live_numbers(
+        crop.of(picture.gray),
+        picture.bit_depth,
+        black_level_gray=known.black_level_gray if known else 0.0,
+    )
+    return PartView(
+        number=picture.number,
+        mean_gray=found.mean_gray,
+        saturated_share=found.saturated_share,
+        sharpness=found.sharpness,
     )
 
 

@@ -17,7 +17,7 @@ from backend.contract.requests import (
     StartRun,
     UndoEdit,
 )
-from backend.contract.rigs import RigOffer, RigView
+from backend.contract.rigs import PartView, RigOffer, RigView
 from backend.contract.scans import (
     ArtifactRef,
     AuditEntry,
@@ -49,7 +49,7 @@ from backend.services.array_uploads import UploadKind, store_upload
 from backend.services.context import Context
 from backend.services.events import EventHub
 from backend.services.export_folder import refuse_foreign
-from backend.services.live_pictures import LIVE_PX, Crop, live_frame
+from backend.services.live_pictures import LIVE_PX, Crop, live_frame, live_part
 from backend.services.pixels import levels_at
 from backend.services.points import pack_points
 from backend.services.previews import Format, Kind, draw, value_at
@@ -369,3 +369,7 @@ class Services:
     ) -> bytes | None:
         """Return the newest picture of a camera as JPEG; never waits. See `live_pictures.live_jpeg`."""
         return live_frame(self.context, rig, camera, max_px=max_px, marks=marks, crop=crop)
+
+    def live_part(self, rig: str, camera: str, crop: Crop) -> PartView | None:
+        """Tell what a part of the newest picture of a camera says; never waits. See `live_pictures.live_part`."""
+        return live_part(self.context, rig, camera, crop)

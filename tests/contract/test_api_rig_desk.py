@@ -305,6 +305,11 @@ def test_marks_and_parts_of_a_picture(bench: Bench) -> None:
     assert np.ptp(plain.astype(int), axis=-1).max() < 12
     assert (marked[:, :, 0].astype(int) - marked[:, :, 2]).max() > 100, "red"
     assert part.shape == (16, 16, 3)
+    told = bench.viewer.get(f"{RIG}/cameras/left/part", params={"x": 3, "y": 2, "part_px": 16})
+    assert told.json()["mean_gray"] == pytest.approx(part.mean(), abs=2.0)
+    assert 0.0 <= told.json()["saturated_share"] <= 1.0
+    nowhere = bench.viewer.get(f"{RIG}/cameras/top/part", params={"x": 3, "y": 2})
+    assert (nowhere.status_code, nowhere.json()) == (200, None)
     beyond = bench.viewer.get(address, params={"x": 24, "y": 2})
     assert (beyond.status_code, beyond.json()["detail"]) == (
         404,
