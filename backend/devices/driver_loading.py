@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from backend.devices.errors import RigConfigError
+from backend.devices.options import meant, shortened
 from backend.devices.pages import PageDesk
 from backend.devices.plug_ins import (
     IMPORT_S,
@@ -145,8 +146,10 @@ def _imported(group: str, name: str, driver: str, within_s: float) -> Any:
             return load_plug_in(entry, within_s)
         except RigConfigError as error:
             raise RigConfigError(f"{name}: {error.sentence}") from error
-    known = ", ".join(available_drivers(group))
-    raise RigConfigError(f"{name}: there is no driver {driver!r}; choose {known}")
+    known = available_drivers(group)
+    raise RigConfigError(
+        f"{name}: there is no driver {shortened(repr(driver))}; choose {', '.join(known)}{meant(driver, known)}"
+    )
 
 
 def _made(group: str, name: str, driver: str, options: Mapping[str, Any], **more: object) -> Any:

@@ -1,12 +1,16 @@
 """Options of rigs and drivers as pydantic models, refused in one sentence."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from ipaddress import AddressValueError, IPv4Address
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from backend.devices.errors import RigConfigError
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 
 def _size_from_text(value: object) -> object:
@@ -22,6 +26,8 @@ DisplaySize = Annotated[tuple[_Pixels, _Pixels], BeforeValidator(_size_from_text
 """The same of a real display."""
 SerialNumber = Annotated[str, Field(coerce_numbers_to_str=True)]
 """YAML reads one that consists of digits as a number."""
+_LONGEST_VALUE = 80
+"""Of a value, in a sentence."""
 _EVERYBODY = IPv4Address("255.255.255.255")
 
 
@@ -86,8 +92,33 @@ def read_options(model: type[AnyOptions], device: str, options: Mapping[str, Any
         raise RigConfigError(f"{device}: {_problem(model, options, error)}") from None
 
 
+def meant(name: str, known: Iterable[str]) -> str:
+    """Ask for the known name that looks like one that isn't: the end of a sentence, empty if none does.
+
+    Examples
+    --------
+    >>> meant("adress", ("address", "serial"))
+    "; did you mean 'address'?"
+    >>> meant("colour", ("address", "serial"))
+    ''
+    """
+    near = get_close_matches(name.lower(), list(known), n=1, cutoff=0.7)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def telling(found: "Sequence[ErrorDetails]") -> "ErrorDetails":
+    """Return what is worth a sentence: an unknown name before a missing one, which it may stand for."""
+    unknown = [one for one in found if one["type"] == "extra_forbidden"]
+    return (unknown or found)[0]
+
+
+def shortened(text: str) -> str:
+    """Cut what a file brings down to what a sentence can hold."""
+    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"
+
+
 def _problem(model: type[DeviceOptions], options: Mapping[str, Any], error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
+    first = telling(error.errors(include_url=False))
     message = first["msg"].removeprefix("Value error, ")
     problem = message[0].lower() + message[1:]
     if not first["loc"]:
@@ -98,5 +129,7 @@ def _problem(model: type[DeviceOptions], options: Mapping[str, Any], error: Vali
     if first["type"] == "extra_forbidden":
         # A driver's own options go before those that it shares with others.
         names = sorted(model.model_fields, key=lambda name: name not in model.__annotations__)
-        return f"there is no option {option!r}; the options are {', '.join(names)}"
-    return f"option {option} can't be {options.get(option, first['input'])!r}: {problem}"
+        unknown = shortened(repr(option))
+        return f"there is no option {unknown}; the options are {', '.join(names)}{meant(option, names)}"
+    value = shortened(repr(options.get(option, first["input"])))
+    return f"option {option} can't be {value}: {problem}"

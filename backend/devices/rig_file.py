@@ -20,7 +20,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, get_args
 
-import yaml
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -35,8 +34,9 @@ from backend.devices.assembled import AssembledRig, CameraLimits, SensorFacts
 from backend.devices.calibration_entries import CalibrationEntry
 from backend.devices.driver_loading import make_camera, make_projector
 from backend.devices.errors import RigConfigError
-from backend.devices.options import DisplaySize
+from backend.devices.options import DisplaySize, meant, shortened, telling
 from backend.devices.pages import PageDesk
+from backend.devices.plain_yaml import read_yaml
 from backend.devices.protocols import Projector, SequenceProjector, TriggerSource
 
 _LINES = [s.value for s in TriggerSource if s.value.startswith("Line")]
@@ -134,7 +134,7 @@ class RigFile(_Part):
         try:
             return cls.model_validate(document)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
+            first = telling(error.errors(include_url=False))
             raise RigConfigError(f"rig file {name}: {_problem(cls, first)}") from None
 
     @property
@@ -236,62 +236,21 @@ def _refuse_useless_wires(file: RigFile, projector: Projector) -> None:
         )
 
 
-class _Loader(yaml.SafeLoader):
-    """Refuses a key that stands twice: the first entry would be lost without a word."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """Read a mapping."""
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        twice = [key for key in keys if keys.count(key) > 1]
-        if twice:
-            raise yaml.YAMLError(
-                f"{twice[0]!r} stands twice in the entry that begins in line {node.start_mark.line + 1}"
-            )
-        return dict(super().construct_mapping(node, deep))
-
-
-def read_yaml(what: str, path: Path) -> Any:
-    """Read a YAML file; `what` is what sentences call it.
-
-    Raises
-    ------
-    RigConfigError
-        If it can't be read, isn't YAML, or a key stands twice.
-    """
-    try:
-        return yaml.load(path.read_text("utf-8"), _Loader)  # noqa: S506  a safe loader
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RigConfigError(
-            f"{what} {path} can't be read ({reason}); check name and rights"
-        ) from error
-    except yaml.YAMLError as error:
-        raise RigConfigError(
-            f"{what} {path} isn't YAML ({_words(error)}); mend that line"
-        ) from error
-
-
-def _words(error: yaml.YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None)
-    if mark is None:
-        return " ".join(str(error).split())[:120]
-    return f"line {mark.line + 1}: {getattr(error, 'problem', '') or 'wrong'}"
-
-
 def _problem(model: type[BaseModel], found: Any) -> str:
     """Say what is wrong with an entry, and which there are where it is unknown."""
     *above, last = found["loc"] or ("",)
-    place = ".".join(map(str, found["loc"])) or "the whole file"
+    place = shortened(".".join(map(str, found["loc"]))) or "the whole file"
     if found["type"] == "missing":
         return f"{place} is missing; add it"
     if found["type"] == "extra_forbidden":
-        known = ", ".join(_model_at(model, above).model_fields)
+        known = list(_model_at(model, above).model_fields)
         within = f" in {'.'.join(map(str, above))}" if above else ""
-        return f"there is no entry {str(last)!r}{within}; the entries are {known}"
+        unknown = shortened(repr(str(last)))
+        return f"there is no entry {unknown}{within}; the entries are {', '.join(known)}{meant(str(last), known)}"
     problem = str(found["msg"]).removeprefix("Value error, ")
     problem = problem[0].lower() + problem[1:]
     if isinstance(found["input"], str | int | float | bool):
-        return f"{place} can't be {found['input']!r}: {problem}; mend it"
+        return f"{place} can't be {shortened(repr(found['input']))}: {problem}; mend it"
     of_all = not found["loc"] and found["type"] == "value_error"  # it names the place itself
     return f"{problem}; mend it" if of_all else f"{place}: {problem}; mend it"
 

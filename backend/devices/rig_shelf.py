@@ -14,8 +14,9 @@ from backend.devices.errors import RigConfigError, RigNotFoundError
 from backend.devices.loading import available_rigs, open_rig
 from backend.devices.options import DisplaySize
 from backend.devices.pages import PageDesk
+from backend.devices.plain_yaml import read_yaml
 from backend.devices.protocols import Rig
-from backend.devices.rig_file import RigFile, assemble, read_yaml
+from backend.devices.rig_file import RigFile, assemble
 from backend.devices.whole_files import write_whole
 
 CALIBRATION_SUFFIX = ".calibration.yaml"
@@ -210,13 +211,24 @@ class RigShelf:
             )
         file = RigFile.read(source)
         assemble(name, file, self._desk)
-        text = source.read_text("utf-8")
+        text = source.read_text("utf-8-sig")
+        if file.calibration is None or isinstance(
+            read_yaml("rig file", source)["calibration"], dict
+        ):
+            return KeptRig(name, write_whole(self._folder / f"{name}.yaml", text))
+        # The name of a file counts from where the rig file was: here it would lead nowhere.
         named = _NAMED_CALIBRATION.search(text)
-        if named is not None and file.calibration is not None:
-            # The name of a file counts from where the rig file was: here it would lead nowhere.
-            self._write_calibration(name, file.calibration, str(source))
-            text = text.replace(named.group(), f"# calibration: see {name}{CALIBRATION_SUFFIX}")
-        return KeptRig(name, write_whole(self._folder / f"{name}.yaml", text))
+        if named is None:
+            raise RigConfigError(
+                f"rig file {source} names its calibration in the middle of a line; write `calibration: FILE` on one of its own"
+            )
+        text = text.replace(named.group(), f"# calibration: see {name}{CALIBRATION_SUFFIX}")
+        beside = self._write_calibration(name, file.calibration, str(source))
+        try:
+            return KeptRig(name, write_whole(self._folder / f"{name}.yaml", text))
+        except RigConfigError:
+            beside.unlink(missing_ok=True)
+            raise
 
     def remove(self, name: str) -> Path:
         """Take a file off the shelf, and calibration and latency, which needn't hold for the next rig of that name.

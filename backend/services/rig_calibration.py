@@ -26,7 +26,7 @@ from backend.devices.calibration_entries import (
     pose_of,
     view_of,
 )
-from backend.devices.rig_file import read_yaml
+from backend.devices.plain_yaml import read_yaml
 from backend.domain.errors import InvalidCalibrationError
 from backend.domain.rig import PinholeModel, Pose
 from backend.numerics.pinhole import RigidTransform, compose, inverse
