@@ -7,7 +7,7 @@ plans are deterministic, so the same frames lead to the same shots.
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -19,17 +19,23 @@ import numpy as np
 from backend.devices.errors import DeviceError, OutOfSync
 from backend.devices.protocols import Frame as DeviceFrame
 from backend.domain.checks import Check
-from backend.domain.errors import InvalidCaptureError, RigFailedError, StageFailedError
+from backend.domain.errors import (
+    InvalidCaptureError,
+    RigFailedError,
+    StageFailedError,
+    StorageFullError,
+)
 from backend.domain.frames import Frame, InMemory, Pixels
 from backend.domain.patterns import Pattern
 from backend.domain.rig import RigFacts
 from backend.domain.shots import Burst, Exposed, Plan, Shot, Until
 from backend.jobs.control import JobControl
+from backend.jobs.evidence import KeepEvidence, chosen, no_evidence
 from backend.jobs.journal import Journal, shot_document, shot_hash
 from backend.jobs.rendering import render
 from backend.jobs.shooting import Shooter, Take
 from backend.jobs.sync_checks import TRIES, SyncWatch
-from backend.jobs.sync_look import Violation
+from backend.jobs.sync_look import Cause, Violation
 from backend.jobs.sync_sets import Planned, Unit, Witness
 from backend.storage.artifacts import ArtifactStore, StoredPixels
 from backend.storage.rows import FrameRow
@@ -37,6 +43,20 @@ from backend.storage.rows import FrameRow
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+_DISPLAY = "the display is late, torn or not lit"
+_LIGHT = "the light changes from frame to frame"
+_STEADY = (
+    "darken the room or keep its lamps steady (those on mains flicker 100 or 120 times a second: expose for whole periods of"
+    " that), let the projector's lamp warm up, and see that the camera doesn't set its exposure or gain itself"
+)
+
+_STILL = "white isn't brighter than black any more: the display stands still or is off, or something covers it or the lens"
+_EARLIER = "the other cameras saw what was shown at the same time"
+_ALONE = (
+    "see that this camera isn't covered, exposes at its trigger and doesn't set its exposure itself, and that its driver hands"
+    " out no frame that was waiting"
+)
 
 _MOST_UNWRITTEN = 4
 """Shots that may wait to be written: memory for a disk that is slow now and then, no more."""
@@ -88,11 +108,15 @@ class CaptureSession:
     """None: nothing is captured, every frame has to be in the journal (a replay)."""
     control: JobControl = field(default_factory=JobControl)
     seen: Seen = _unseen
+    evidence: KeepEvidence = no_evidence
+    """Where frames go that couldn't be verified."""
     clock: Callable[[], float] = time.monotonic
     _occurrences: Counter[str] = field(default_factory=Counter, init=False)
     _masks: dict[int, tuple[Pixels, str]] = field(default_factory=dict, init=False)
     _loaded: tuple[str, ...] = field(default=(), init=False)
     _watch: SyncWatch = field(init=False)
+    _unverified: int = field(default=0, init=False)
+    """Frames that are kept as evidence."""
 
     def __post_init__(self) -> None:
         """Watch over what is captured, unless its light is certain."""
@@ -129,22 +153,18 @@ class CaptureSession:
         CancelledError
             If the job is stopped.
         """
-        white = self._watch.last_white
-        if self.shooter is not None and white is not None:
+        if self.shooter is not None and self._watch.last_look():
             try:
-                self._load([white.shot, *self._shots_of(self._watch.last_black)])
-                if self._watch.judge_drift(self._witness(white)):
-                    black = self._watch.last_black
-                    assert black is not None, "there is one beside each white"
-                    self._watch.judge_drift({}, self._witness(black))
+                self._load(self._watch.markers)
+                for white in self._watch.last_look():
+                    self._watch.judge_white(self._witness(white))
+                for black in self._watch.second_look():
+                    self._watch.judge_black(self._witness(black))
             except DeviceError as error:
                 # The frames are all there: a witness is no reason to lose them.
                 self.control.check()
                 log.warning("The last look at the light of %s failed: %s", self.stage, error)
         return self._watch.checks()
-
-    def _shots_of(self, planned: Planned | None) -> list[Shot]:
-        return [] if planned is None else [planned.shot]
 
     def _witness(self, planned: Planned) -> _Frames:
         assert self.shooter is not None  # `finish` looked
@@ -161,6 +181,7 @@ class CaptureSession:
     def _burst(self, burst: Burst) -> tuple[Exposed, ...]:
         asked = [self._ask(shot) for shot in burst]
         known = [self._known(shares) for shares in asked]
+        self._recall(row for rows in known for row in rows.values())
         missing = {
             i: [share for share in shares if share.camera not in known[i]]
             for i, shares in enumerate(asked)
@@ -201,7 +222,8 @@ class CaptureSession:
             for unit, frames in self._verified(units, burst, kept=len(burst) - len(missing)):
                 if len(writes) >= most:
                     writes[-most].result()
-                writes.append(writer.submit(self._keep_unit, unit, frames, missing))
+                told = self._watch.told
+                writes.append(writer.submit(self._keep_unit, unit, frames, missing, told))
         return {i: rows for write in writes for i, rows in write.result().items()}
 
     def _verified(
@@ -218,7 +240,12 @@ class CaptureSession:
             while len(waiting) < len(unit.planned):
                 chunk = next(chunks)
                 self._tell(pace, done, planned, len(burst), kept=kept)
-                waiting.extend(self.shooter.take_all(chunk))
+                try:
+                    waiting.extend(self.shooter.take_all(chunk))
+                except DeviceError as error:
+                    # What waits for the rest of its set can't be verified any more.
+                    self._keep_evidence(error, planned[done - len(waiting) : done], waiting)
+                    raise
                 done += len(chunk)
             frames = [waiting.popleft() for _ in unit.planned]
             yield self._right(unit, frames, burst)
@@ -234,18 +261,18 @@ class CaptureSession:
             If they never are.
         """
         assert self.shooter is not None  # `_load` refused otherwise
-        first: Violation | None = None
-        for attempt in range(1, TRIES + 1):
+        violations: list[Violation] = []
+        while True:
             violation = self._watch.judge(unit, frames, burst)
             if violation is None:
                 return unit, frames
-            first = first or violation
-            if attempt == TRIES:
-                raise OutOfSync(
-                    first.camera,
-                    f"{first.sentence}, and taken again it wasn't right in {TRIES} tries: the display is late, torn or"
-                    f" not lit, or the room's light has changed; {self.shooter.way_out}",
-                )
+            violations.append(violation)
+            if len(violations) == 1:
+                first = unit, frames
+            if len(violations) == TRIES:
+                error = self._out_of_sync(violations)
+                self._keep_evidence(error, first[0].planned, first[1], violations[0].number)
+                raise error
             self.control.note(f"{violation.camera}: {violation.sentence}; taken again")
             log.warning(
                 "%s/%s, camera %s: %s; taken again",
@@ -255,7 +282,54 @@ class CaptureSession:
             takes = [self._take_of(planned) for planned in unit.planned]
             chunks = self.shooter.chunks(takes)
             frames = [taken for chunk in chunks for taken in self.shooter.take_all(chunk)]
-        raise AssertionError("the last attempt returns or raises")
+
+    def _keep_evidence(
+        self,
+        error: DeviceError,
+        planned: Sequence[Planned],
+        frames: Sequence[_Frames],
+        number: int | None = None,
+    ) -> None:
+        """Keep exposures that don't count, to be looked at; whatever hinders that isn't what the operator has to know."""
+        kept = chosen(planned, frames, number)
+        try:
+            documents = [
+                {
+                    **shot_document(one.planned.shot, self._mask_hash(one.planned.shot.mask)),
+                    "camera": one.camera,
+                    "number": one.planned.number,
+                    "take": self.take,
+                    "artifact": self.store.put(np.ascontiguousarray(one.frame.data)).hash,
+                    "bit_depth": one.frame.bits,
+                    "metadata": _metadata(one.frame),
+                }
+                for one in kept
+            ]
+            if documents and self.evidence(error.sentence, documents):
+                self._unverified += len(documents)
+        except StorageFullError as full:
+            log.warning("Frames that couldn't be verified aren't kept: %s", full)
+
+    def _recall(self, rows: Iterable[FrameRow]) -> None:
+        """Take in what was found of frames when they came: a verdict that holds for whatever is made of them."""
+        for row in rows:
+            self._watch.recall(row.metadata)
+
+    def _out_of_sync(self, violations: Sequence[Violation]) -> OutOfSync:
+        """Say which frame was wrong first, and what is to blame."""
+        assert self.shooter is not None  # `_load` refused otherwise
+        reason = {
+            Cause.DISPLAY: f"{_DISPLAY}; {self.shooter.way_out}",
+            Cause.LIGHT: f"{_LIGHT}; {_STEADY}",
+            Cause.STILL: f"{_STILL}; {self.shooter.way_out}",
+            Cause.CAMERA: f"{_EARLIER}; {_ALONE}",
+            Cause.UNKNOWN: f"{_DISPLAY}, or the room's light has changed; {self.shooter.way_out}",
+        }[self._watch.blame(violations)]
+        first = violations[0]
+        return OutOfSync(
+            first.camera,
+            f"{first.sentence}, and taken again it wasn't right in {TRIES} tries: {reason}",
+        )
 
     def _take_of(self, planned: Planned) -> Take:
         shot = planned.shot
@@ -268,7 +342,11 @@ class CaptureSession:
         )
 
     def _keep_unit(
-        self, unit: Unit, frames: Sequence[_Frames], missing: Mapping[int, Sequence[_Asked]]
+        self,
+        unit: Unit,
+        frames: Sequence[_Frames],
+        missing: Mapping[int, Sequence[_Asked]],
+        told: Mapping[str, object],
     ) -> dict[int, dict[str, FrameRow]]:
         """Write what the plan asked for of a unit, together."""
         taken = [
@@ -277,7 +355,7 @@ class CaptureSession:
             if planned.number is not None
             for share in missing[planned.number]
         ]
-        rows = iter(self._keep(taken))
+        rows = iter(self._keep(taken, told))
         return {
             planned.number: {share.camera: next(rows) for share in missing[planned.number]}
             for planned in unit.planned
@@ -302,7 +380,9 @@ class CaptureSession:
         found = {s.camera: self.journal.find(s.id, s.occurrence) for s in shares}
         return {camera: row for camera, row in found.items() if row is not None}
 
-    def _expose(self, shares: Sequence[_Asked]) -> list[tuple[_Asked, DeviceFrame]]:
+    def _expose(
+        self, shares: Sequence[_Asked], *, steady: bool
+    ) -> list[tuple[_Asked, DeviceFrame]]:
         shot = shares[0].shot
         assert self.shooter is not None  # `_load` refused otherwise
         frames = self.shooter.take(
@@ -310,18 +390,21 @@ class CaptureSession:
             exposure_ms=shot.exposure_ms,
             gain_db=shot.gain_db,
             cameras=[share.camera for share in shares],
+            steady=steady,
         )
         return [(share, frames[share.camera]) for share in shares]
 
-    def _keep(self, taken: Sequence[tuple[_Asked, DeviceFrame]]) -> list[FrameRow]:
+    def _keep(
+        self, taken: Sequence[tuple[_Asked, DeviceFrame]], told: Mapping[str, object]
+    ) -> list[FrameRow]:
         """Write pictures, then their lines in the journal: a crash between the two loses them, nothing else."""
-        rows = [self._row(share, frame) for share, frame in taken]
+        rows = [self._row(share, frame, told) for share, frame in taken]
         self.journal.add(tuple(rows))
         for (share, frame), row in zip(taken, rows, strict=True):
             self.seen(share.camera, frame, row)
         return rows
 
-    def _row(self, share: _Asked, frame: DeviceFrame) -> FrameRow:
+    def _row(self, share: _Asked, frame: DeviceFrame, told: Mapping[str, object]) -> FrameRow:
         return FrameRow(
             scan=self.scan,
             stage=self.stage,
@@ -333,7 +416,7 @@ class CaptureSession:
             artifact=self.store.put(np.ascontiguousarray(frame.data)).hash,
             bit_depth=frame.bits,
             when=datetime.now(UTC),
-            metadata=_metadata(frame),
+            metadata={**_metadata(frame), **told},
         )
 
     def _frame(self, share: _Asked, row: FrameRow) -> Frame:
@@ -353,6 +436,7 @@ class CaptureSession:
     def _until(self, request: Until) -> Exposed:
         shares = self._ask(request.shot)
         rows = self._known(shares)
+        self._recall(rows.values())
         if len(rows) < len(shares):
             try:
                 rows = self._wait(request, shares)
@@ -361,14 +445,36 @@ class CaptureSession:
         return {share.camera: self._frame(share, rows[share.camera]) for share in shares}
 
     def _wait(self, request: Until, shares: Sequence[_Asked]) -> dict[str, FrameRow]:
-        self._load([request.shot])
+        """Repeat a shot until its picture is wanted; one that isn't right, or not lit, isn't offered again."""
+        burst = (request.shot,)
+        (unit,) = self._watch.units(burst, {0: tuple(share.camera for share in shares)})
+        self._load([request.shot, *self._watch.markers])
         deadline = self.clock() + request.timeout_s
+        # Fields and marker come first, in the order of their own; the picture may be long in coming.
+        besides = [self._besides(planned) for planned in unit.planned if planned.number is None]
+        violations: list[Violation] = []
+        is_lit = not besides
         while True:
             self.control.shots(None, f"waiting, {request.shot.role or 'picture'} by picture", None)
-            taken = self._expose(shares)
+            taken = self._expose(shares, steady=not is_lit)
+            frames = {share.camera: frame for share, frame in taken}
+            is_lit = True
             if request.ready({share.camera: _unsaved(share, frame) for share, frame in taken}):
-                rows = self._keep(taken)
-                return {share.camera: row for share, row in zip(shares, rows, strict=True)}
+                others = iter(besides)
+                shown = [frames if p.number is not None else next(others) for p in unit.planned]
+                violation = self._watch.judge(unit, shown, burst)
+                if violation is None:
+                    rows = self._keep(taken, self._watch.told)
+                    return {share.camera: row for share, row in zip(shares, rows, strict=True)}
+                violations.append(violation)
+                if len(violations) == TRIES:
+                    error = self._out_of_sync(violations)
+                    self._keep_evidence(error, unit.planned, shown)
+                    raise error
+                self.control.note(f"{violation.camera}: {violation.sentence}; taken again")
+                unit = self._watch.again(unit)
+                besides = [self._besides(p) for p in unit.planned if p.number is None]
+                is_lit = False
             for share, frame in taken:
                 self.seen(share.camera, frame, None)
             if self.clock() >= deadline:
@@ -376,6 +482,11 @@ class CaptureSession:
                     f"{self.stage} waited {request.timeout_s:g} s for a usable picture and none came: "
                     f"look at the live picture and run again."
                 )
+
+    def _besides(self, planned: Planned) -> _Frames:
+        """Expose what nobody asked for."""
+        assert self.shooter is not None  # `_load` refused otherwise
+        return self.shooter.take_all([self._take_of(planned)])[0]
 
     # what the projector gets
 
@@ -429,8 +540,9 @@ class CaptureSession:
         kept = len(self.journal)
         frames = "1 captured frame is" if kept == 1 else f"{kept} captured frames are"
         cause = error.sentence.removesuffix(".")
+        beside = f" (and {self._unverified} that count for nothing, to look at)"
         return RigFailedError(
-            f"{cause}; {frames} kept, mend it and run again to go on.",
+            f"{cause}; {frames} kept{beside if self._unverified else ''}, mend it and run again to go on.",
             details={"device": error.device},
         )
 

@@ -7,7 +7,7 @@ job continues where it was, and an edit made meanwhile counts.
 import logging
 import platform
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
@@ -27,6 +27,7 @@ from backend.jobs.calibrations import hand_over
 from backend.jobs.capture import CaptureSession
 from backend.jobs.control import JobControl, Live
 from backend.jobs.device_threads import DeviceThreads
+from backend.jobs.evidence import ACTION, MOST_LINES, evidence_of
 from backend.jobs.journal import DatabaseJournal
 from backend.jobs.live import LivePicture
 from backend.jobs.loading import NO_RIG, LoadedScan, load_inputs, load_scan
@@ -44,7 +45,7 @@ from backend.jobs.stage_work import (
     perform,
     stage_errors,
 )
-from backend.jobs.sync_checks import DRIFT, SYNCHRONISATION
+from backend.jobs.sync_checks import DRIFT, STILLNESS, SYNCHRONISATION
 from backend.jobs.views import job_view
 from backend.methods import Registry
 from backend.storage.artifacts import ArtifactStore
@@ -253,8 +254,10 @@ class JobExecution:
                 )
         with stage_errors(stage):
             outcome = conclude(stage, result, params, self._shop.store)
-        found = tuple(asdict(check) for check in verified) or _found_before(planned, scan)
-        return replace(outcome, checks=(*outcome.checks, *found), device=device)
+        # What is known of frames from now goes before what was found when the take was run first.
+        found = {c["name"]: c for c in _found_before(planned, scan)}
+        found |= {check.name: asdict(check) for check in verified}
+        return replace(outcome, checks=(*outcome.checks, *found.values()), device=device)
 
     def _shoot(
         self,
@@ -291,6 +294,7 @@ class JobExecution:
             shooter=shooter,
             control=self.control,
             seen=lambda camera, frame, row: self._seen(scan, camera, frame, row),
+            evidence=lambda reason, frames: self._keep_evidence(stage, reason, frames),
         )
         with stage_errors(stage):
             result = stage.run(
@@ -317,6 +321,19 @@ class JobExecution:
                     text=self.control.live.text,
                 )
             )
+
+    def _keep_evidence(
+        self, stage: Stage, reason: str, frames: Sequence[Mapping[str, Any]]
+    ) -> bool:
+        """Note frames that couldn't be verified in the audit trail, which keeps them to be looked at."""
+        with self._writing() as repositories:
+            lines = sum(1 for _ in evidence_of(repositories.audit.of(self._job.scan)))
+            if lines >= MOST_LINES:
+                return False
+            count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
+            sentence = f"{count} of {stage.title} can't be verified and kept only to be looked at: {reason}"
+            self._audit(repositories, ACTION, stage.name, sentence, {"frames": list(frames)})
+        return True
 
     # what the database gets to know
 
@@ -431,7 +448,7 @@ def _found_before(planned: PlannedStage, scan: LoadedScan) -> tuple[dict[str, An
     """Return what was found of a take's frames when they came: that holds for all that is computed of them."""
     for run in reversed(scan.runs):
         if (run.stage, run.take) == (planned.name, planned.take):
-            found = tuple(c for c in run.checks if c["name"] in (SYNCHRONISATION, DRIFT))
+            found = tuple(c for c in run.checks if c["name"] in (SYNCHRONISATION, DRIFT, STILLNESS))
             if found:
                 return found
     return ()

@@ -1,7 +1,9 @@
 """One camera's look at the frames that are verified together."""
 
-from collections.abc import Mapping, Sequence
+import enum
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import isclose
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,11 @@ from backend.numerics.sync_checks import (
     Fields,
     Finding,
     FrameSample,
+    Movement,
     black_light,
     common_part,
+    drift,
+    is_unchanged,
     level,
     marker_light,
     pair_part,
@@ -35,6 +40,26 @@ WHITE_LEAST = 0.3
 """White may be so much darker than expected: a camera's tone curve isn't known."""
 
 
+FIELD_RANGE = 8.0
+"""White and black tell of exposures that are longer or shorter by this factor at most: a black level isn't known, and what
+is dark at one exposure says little of another one."""
+
+
+class Cause(enum.Enum):
+    """What a frame that isn't right tells of the reason."""
+
+    DISPLAY = "display"
+    """It shows another pattern, or a part of one."""
+    LIGHT = "light"
+    """It is brighter or darker all over."""
+    STILL = "still"
+    """White isn't brighter than black any more."""
+    CAMERA = "camera"
+    """The other cameras saw what was shown."""
+    UNKNOWN = "unknown"
+    """It may be the display or the light."""
+
+
 @dataclass(frozen=True)
 class Violation:
     """A frame that doesn't show what it was taken for."""
@@ -42,20 +67,51 @@ class Violation:
     camera: str
     sentence: str
     """Which frame, what was seen, what is allowed."""
+    cause: Cause = Cause.UNKNOWN
+    number: int | None = None
+    """The frame's place in the burst, if it is one of the plan's."""
 
 
 @dataclass
 class Known:
     """What earlier frames of a stage told: what later ones are compared with."""
 
-    fields: dict[str, Fields] = field(default_factory=dict)
-    """White and black, by camera."""
+    fields: dict[str, list[Fields]] = field(default_factory=dict)
+    """White and black, by camera: for every range of exposures the newest."""
+    first: dict[str, Fields] = field(default_factory=dict)
+    """The first white and black that the camera sees the projector by: what drifts is compared with."""
+    tried: dict[tuple[str, float], Fields] = field(default_factory=dict)
+    """White and black as they were exposed last, in a unit that was right or not."""
     common: dict[tuple[Any, str], CommonPart] = field(default_factory=dict)
     """What sets of a family have in common, by family and camera; of one burst."""
-    before: dict[str, FrameSample] = field(default_factory=dict)
-    """The frame taken last, by camera."""
+    before: dict[str, tuple[FrameSample, int | None]] = field(default_factory=dict)
+    """The frame taken last and its place in the burst, by camera."""
     levels: dict[tuple[float, str], dict[float, float]] = field(default_factory=dict)
     """Brightness of uniform fields by their code, by exposure and camera; of one burst."""
+
+    def take_in(self, camera: str, new: Sequence[Fields]) -> None:
+        """Let new fields replace those of their exposure."""
+        for one in new:
+            old = self.fields.setdefault(camera, [])
+            old[:] = [o for o in old if not isclose(o.exposure, one.exposure)]
+            old.append(one)
+            if one.seen:
+                self.first.setdefault(camera, one)
+
+    def forget(self, camera: str) -> None:
+        """Compare nothing with what a camera saw under another light."""
+        for kept in (self.common, self.levels):
+            for key in [key for key in kept if key[1] == camera]:
+                del kept[key]
+
+
+def nearest(known: Sequence[Fields], exposure: float) -> Fields | None:
+    """Return the fields that tell most of an exposure: the longest that aren't longer, among those that are seen."""
+    usable = [f for f in known if f.seen] or list(known)
+    below = [f for f in usable if f.exposure <= exposure * (1 + 1e-6)]
+    if below:
+        return max(below, key=lambda f: f.exposure)
+    return min(usable, key=lambda f: f.exposure, default=None)
 
 
 @dataclass
@@ -67,18 +123,25 @@ class Findings:
     markers: int = 0
     marker: float = 0.0
     frames: int = 0
+    untold: int = 0
+    """Frames of the plan that only markers tell of."""
+    unseen: dict[str, str] = field(default_factory=dict)
+    """Cameras that can't tell the projector's white from its black, and why."""
     again: int = 0
     """Units that were taken again."""
     drifts: dict[str, float] = field(default_factory=dict)
     """Of white, by camera, as a share of the projector's light."""
     dark_drifts: dict[str, float] = field(default_factory=dict)
     """Of black, where white has drifted."""
+    movements: dict[str, Movement] = field(default_factory=dict)
+    """Of the picture, by camera."""
 
     def note(self, found: "Findings") -> None:
         """Take in what was found of a unit that is right."""
         self.sets += found.sets
         self.markers += found.markers
         self.frames += found.frames
+        self.untold += found.untold
         self.deviation = max(self.deviation, found.deviation)
         self.marker = max(self.marker, found.marker)
 
@@ -105,9 +168,13 @@ class Look:
         self._planned = [p for p, _ in own]
         self._samples = [sample_of(frame) for _, frame in own]
         self._of = {p.number: n for n, p in enumerate(self._planned) if p.number is not None}
+        self.fields: list[Fields] = []
+        """White and black of this unit."""
+        self.change: tuple[float, float] | None = None
+        """How white and black have changed since they were exposed before, where it is more than markers may."""
         self.common: dict[tuple[Any, str], CommonPart] = {}
         self.levels: dict[tuple[float, str], dict[float, float]] = {}
-        self.last = self._samples[-1]
+        self.last = self._samples[-1], self._planned[-1].number
 
     def judge(self) -> Violation | None:
         """Return the first frame that isn't right, None if all are."""
@@ -117,23 +184,51 @@ class Look:
     # uniform fields
 
     def _witnesses(self) -> Violation | None:
-        shown = {p.witness: n for n, p in enumerate(self._planned)}
-        if Witness.WHITE in shown and Witness.BLACK in shown:
-            white, black = (shown[w] for w in (Witness.WHITE, Witness.BLACK))
+        for white, black in self._pairs():
             exposure = exposure_of(self._planned[white].shot)
             a, b = self._samples[white], self._samples[black]
             if Fields(b, a, exposure).seen:
                 return self._violation("the white field is darker than the black one")
-            self._known.fields[self._camera] = Fields(a, b, exposure)
+            fields = Fields(a, b, exposure)
+            before = self._known.tried.get((self._camera, exposure))
+            self._known.tried[self._camera, exposure] = fields
+            if before is not None and before.seen:
+                if not fields.seen:
+                    self._known.tried[self._camera, exposure] = before
+                    return self._violation("white and black look the same by now", Cause.STILL)
+                self._compare(before, fields)
+            self.fields.append(fields)
         return None
+
+    def _pairs(self) -> Iterator[tuple[int, int]]:
+        """Find white and the black that follows it."""
+        for n, (one, other) in enumerate(zip(self._planned, self._planned[1:], strict=False)):
+            if (one.witness, other.witness) == (Witness.WHITE, Witness.BLACK):
+                yield n, n + 1
+
+    def _compare(self, before: Fields, now: Fields) -> None:
+        white = drift(before.white, now.white, before) or 0.0
+        black = drift(before.black, now.black, before) or 0.0
+        if max(abs(white), abs(black)) > MARKER_LIMIT:
+            self.change = white, black
+
+    def _fields(self, exposure: float) -> Fields | None:
+        """Return white and black that tell of an exposure: this unit's, or earlier ones."""
+        own = [f.exposure for f in self.fields]
+        earlier = [
+            f
+            for f in self._known.fields.get(self._camera, ())
+            if not any(isclose(f.exposure, e) for e in own)
+        ]
+        return nearest([*self.fields, *earlier], exposure)
 
     def _unseen_fields(self) -> Violation | None:
         """See whether anything is brighter than white was, or darker than black: then those came too late."""
-        fields = self._known.fields.get(self._camera)
-        if fields is None or fields.seen:
-            return None
         for planned, sample in zip(self._planned, self._samples, strict=True):
             exposure = exposure_of(planned.shot)
+            fields = self._fields(exposure)
+            if fields is None or fields.seen:
+                continue
             name = "the marker" if planned.number is None else self._named(planned.number)
             if Fields(sample, fields.at_most(exposure), exposure).seen:
                 return self._violation(f"{name} is brighter than the white field")
@@ -142,11 +237,11 @@ class Look:
         return None
 
     def _markers(self) -> Violation | None:
-        fields = self._known.fields.get(self._camera)
         for n, planned in enumerate(self._planned):
+            exposure = exposure_of(planned.shot)
+            fields = self._fields(exposure)
             if planned.witness is not Witness.MARKER or fields is None:
                 continue
-            exposure = exposure_of(planned.shot)
             if planned.shot.pattern == WHITE:
                 share = white_light(self._samples[n], fields, exposure)
                 if share is not None and share < WHITE_LEAST:
@@ -197,20 +292,25 @@ class Look:
             return disorder
         if one.kind in (SetKind.WHITE, SetKind.BLACK):
             return self._uniform(one, samples[0])
-        before = self._known.before.get(self._camera)
-        if places[0] > 0:
-            before = self._samples[places[0] - 1]
-        found, limit = self._finding(one, samples, before)
+        before = [self._exposed_before(n) for n in places]
+        found, limit = self._finding(one, samples, [sample for sample, _ in before])
         if found is None:
-            return None
+            self._found.untold += len(samples) if not self._is_ordered(one) else 0
+            return self._unchanged(one.numbers[0], samples[0], *before[0])
         self._found.sets += 1
         self._found.deviation = max(self._found.deviation, found.share)
         if found.share <= limit:
             return None
         return self._deviation(one, found, limit)
 
+    def _exposed_before(self, place: int) -> tuple[FrameSample | None, int | None]:
+        """Return what was exposed right before, and where in the burst, if it isn't a witness."""
+        if place > 0:
+            return self._samples[place - 1], self._planned[place - 1].number
+        return self._known.before.get(self._camera, (None, None))
+
     def _finding(
-        self, one: FrameSet, samples: Sequence[FrameSample], before: FrameSample | None
+        self, one: FrameSet, samples: Sequence[FrameSample], before: Sequence[FrameSample | None]
     ) -> tuple[Finding | None, float]:
         if one.kind is SetKind.SAME:
             return same(samples), SET_LIMIT
@@ -225,7 +325,7 @@ class Look:
         return (None if part is None else self._compared(one, part, before)), SET_LIMIT
 
     def _compared(
-        self, one: FrameSet, part: CommonPart, before: FrameSample | None
+        self, one: FrameSet, part: CommonPart, before: Sequence[FrameSample | None]
     ) -> Finding | None:
         """Compare with an earlier set of the family; the first one waits for the second."""
         key = (one.family, self._camera)
@@ -235,15 +335,46 @@ class Look:
             return None
         return part.against(known, before)
 
+    def _is_ordered(self, one: FrameSet) -> bool:
+        """Tell whether the set is a field that is compared with other fields, or waits for a partner."""
+        shot = self._burst[one.numbers[-1]]
+        ordered = len(self.levels.get((exposure_of(shot), self._camera), ())) > 1
+        return one.needs_partner or (isinstance(shot.pattern, Uniform) and ordered)
+
+    def _unchanged(
+        self, number: int, sample: FrameSample, before: FrameSample | None, last: int | None
+    ) -> Violation | None:
+        """See whether a gray field is as bright as another one that was exposed right before it."""
+        if last is None or before is None:
+            return None
+        here, there = self._burst[number], self._burst[last]
+        exposure = exposure_of(here)
+        fields = self._fields(exposure)
+        if not (isinstance(here.pattern, Uniform) and isinstance(there.pattern, Uniform)):
+            return None
+        codes = here.pattern.gray, there.pattern.gray
+        masked = here.mask is not None or there.mask is not None
+        if fields is None or masked or codes[0] == codes[1] or exposure_of(there) != exposure:
+            return None
+        if not is_unchanged(sample, before, codes, fields, exposure):
+            return None
+        return self._violation(
+            f"{self._named(number)} shows what was shown before: it is as bright as gray {codes[1]:g}",
+            Cause.DISPLAY,
+            number,
+        )
+
     def _disorder(self, one: FrameSet, sample: FrameSample) -> Violation | None:
         """See whether a brighter code is darker than another one, at one exposure: whatever the display's gamma is."""
-        shot, fields = self._burst[one.numbers[-1]], self._known.fields.get(self._camera)
+        shot = self._burst[one.numbers[-1]]
+        exposure = exposure_of(shot)
+        fields = self._fields(exposure)
         if not isinstance(shot.pattern, Uniform) or shot.mask is not None or fields is None:
             return None
-        exposure, code = exposure_of(shot), shot.pattern.gray
+        code = shot.pattern.gray
         key = (exposure, self._camera)
         known = dict(self.levels.get(key) or self._known.levels.get(key, {}))
-        if exposure == fields.exposure:
+        if isclose(exposure, fields.exposure):
             known |= {
                 255.0: level(fields.white, fields) or 0.0,
                 0.0: level(fields.black, fields) or 0.0,
@@ -264,8 +395,8 @@ class Look:
         return None
 
     def _uniform(self, one: FrameSet, sample: FrameSample) -> Violation | None:
-        fields = self._known.fields.get(self._camera)
         shot = self._burst[one.numbers[0]]
+        fields = self._fields(exposure_of(shot))
         if fields is None:
             return None
         if one.kind is SetKind.BLACK:
@@ -289,20 +420,43 @@ class Look:
         amount = (
             f"it deviates from its set by {found.share:.0%} of the light, {limit:.0%} are allowed"
         )
+        cause = Cause.LIGHT if found.even else Cause.DISPLAY
+        if one.kind is SetKind.SAME:
+            cause = Cause.UNKNOWN  # any other field is brighter or darker all over, too
         if found.frame is None:
             first, last = (self._named(one.numbers[i]) for i in (0, -1))
-            return self._violation(f"a frame from {first} to {last} is wrong: {amount}")
-        name = self._named(one.numbers[found.frame])
-        shows = "shows what was shown before" if found.repeats else "doesn't show its pattern"
-        return self._violation(f"{name} {shows}: {amount}")
+            what = "is brighter or darker all over" if found.even else "is wrong"
+            return self._violation(
+                f"a frame from {first} to {last} {what}: {amount}", cause, one.numbers[0]
+            )
+        number = one.numbers[found.frame]
+        shows = "doesn't show its pattern"
+        if found.repeats:
+            shows = "shows what was shown before"
+        elif self._is_dark(number):
+            cause = Cause.DISPLAY
+        elif found.even:
+            shows = "is brighter or darker all over"
+        return self._violation(f"{self._named(number)} {shows}: {amount}", cause, number)
+
+    def _is_dark(self, number: int) -> bool:
+        """Tell whether a frame shows nothing at all."""
+        exposure = exposure_of(self._burst[number])
+        fields = self._fields(exposure)
+        if fields is None:
+            return False
+        share = black_light(self._samples[self._of[number]], fields, exposure)
+        return share is not None and share < MARKER_LIMIT
 
     def _named(self, number: int) -> str:
         shot = self._burst[number]
         role = f"{shot.role} " if shot.role else ""
         return f"{role}frame {number + 1} of {len(self._burst)} ({_words(shot.pattern)}, {shot.exposure_ms:.4g} ms)"
 
-    def _violation(self, sentence: str) -> Violation:
-        return Violation(self._camera, sentence)
+    def _violation(
+        self, sentence: str, cause: Cause = Cause.UNKNOWN, number: int | None = None
+    ) -> Violation:
+        return Violation(self._camera, sentence, cause, number)
 
 
 def sample_of(frame: Frame) -> FrameSample:

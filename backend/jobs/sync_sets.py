@@ -99,13 +99,12 @@ def sets_of(burst: Sequence[Shot], cameras: Mapping[int, tuple[str, ...]]) -> li
 
 
 def units_of(
-    burst: Sequence[Shot],
-    cameras: Mapping[int, tuple[str, ...]],
-    *,
-    seed: str,
-    first: Sequence[Planned] = (),
+    burst: Sequence[Shot], cameras: Mapping[int, tuple[str, ...]], *, seed: str
 ) -> list[Unit]:
     """Cut a burst into units, the first of which holds the marker.
+
+    Where a set follows one of the same patterns (a single fringe at several exposures), there is one more: the last
+    step, shown once more, would be the first of a set that fits, with every phase wrong.
 
     Parameters
     ----------
@@ -115,8 +114,6 @@ def units_of(
         Shots to be taken, by their place in the burst, and the cameras that take them.
     seed
         Of the marker's place.
-    first
-        What is exposed before everything else.
     """
     sets = sets_of(burst, cameras)
     place = _place(seed, len(cameras))
@@ -132,8 +129,17 @@ def units_of(
         compared |= {s.family for s in joined}
         joined = []
     if units:
-        units[0] = _marked(units[0], place, tuple(first))
-    return units
+        units[0] = _marked(units[0], place)
+    return [
+        unit if n == 0 else _told_apart(unit, burst[units[n - 1].sets[-1].numbers[-1]])
+        for n, unit in enumerate(units)
+    ]
+
+
+def _told_apart(unit: Unit, before: Shot) -> Unit:
+    """Put a marker in front of a unit that begins with what was shown before, at another exposure or under a mask."""
+    first = unit.planned[0].shot
+    return _marked(unit, 0) if _same_patterns(before.pattern, first.pattern) else unit
 
 
 def marked_again(unit: Unit, *, seed: str) -> Unit:
@@ -143,7 +149,21 @@ def marked_again(unit: Unit, *, seed: str) -> Unit:
     on: a set that fits, with every phase wrong.
     """
     shots = sum(p.number is not None for p in unit.planned)
-    return _marked(unit, _place(seed, shots), ())
+    return _marked(unit, _place(seed, shots))
+
+
+def with_fields(unit: Unit, lights: Sequence[tuple[Shot, tuple[str, ...]]]) -> Unit:
+    """Expose white and black before everything else, with the exposure and gain of some shots, by some cameras."""
+    fields = [
+        Planned(
+            Shot(pattern, shot.exposure_ms, shot.gain_db, role=witness.value),
+            cameras,
+            witness=witness,
+        )
+        for shot, cameras in lights
+        for pattern, witness in ((WHITE, Witness.WHITE), (BLACK, Witness.BLACK))
+    ]
+    return Unit((*fields, *unit.planned), unit.sets)
 
 
 def _place(seed: str, shots: int) -> int:
@@ -167,7 +187,7 @@ def _unit(
     return Unit(tuple(Planned(burst[n], cameras[n], n) for n in numbers), tuple(sets))
 
 
-def _marked(unit: Unit, place: int, first: tuple[Planned, ...]) -> Unit:
+def _marked(unit: Unit, place: int) -> Unit:
     planned = unit.planned
     asked = [n for n, p in enumerate(planned) if p.number is not None]
     beside = planned[asked[min(place, len(asked) - 1)]]
@@ -180,7 +200,7 @@ def _marked(unit: Unit, place: int, first: tuple[Planned, ...]) -> Unit:
         role="marker",
     )
     marker = Planned(shot, beside.cameras, witness=Witness.MARKER)
-    return Unit((*first, *planned[:at], marker, *planned[at:]), unit.sets)
+    return Unit((*planned[:at], marker, *planned[at:]), unit.sets)
 
 
 def _is_dark(pattern: Pattern) -> bool:
@@ -194,14 +214,21 @@ def _is_dark(pattern: Pattern) -> bool:
 
 def _joins(group: Sequence[Shot], shot: Shot) -> bool:
     first = group[0]
-    if _light(first) != _light(shot):
-        return False
     a, b = first.pattern, shot.pattern
-    if isinstance(a, Sine) and isinstance(b, Sine):
+    if _light(first) != _light(shot) or not _same_patterns(a, b):
+        return False
+    if isinstance(b, Sine):
         shifts = {s.pattern.shift_rad for s in group if isinstance(s.pattern, Sine)}
-        return _fringe(a) == _fringe(b) and b.shift_rad not in shifts
+        return b.shift_rad not in shifts
+    return len(group) == 1 if isinstance(b, Gray | Stripe) else a == b
+
+
+def _same_patterns(a: Pattern, b: Pattern) -> bool:
+    """Tell whether two patterns are steps of one fringe, a pattern and its inverse, or the same field."""
+    if isinstance(a, Sine) and isinstance(b, Sine):
+        return _fringe(a) == _fringe(b)
     if isinstance(a, Gray | Stripe) and isinstance(b, Gray | Stripe):
-        return len(group) == 1 and b == a.model_copy(update={"inverse": not a.inverse})
+        return b == a.model_copy(update={"inverse": not a.inverse})
     return isinstance(a, Uniform) and a == b
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,6 +34,14 @@ _DRIFT_SIGMA = 0.003
 """Standard deviation up to which a drift counts as known."""
 _REPEATED = 0.25
 """Two frames that differ by less than this share of what they should show the same."""
+_EVEN = 0.7
+"""A deviation that is correlated with the light by so much is brighter (or darker) everywhere: no other pattern is."""
+_GRAYS_LIKELY = (48.0, 232.0)
+"""Between these codes every display is brighter for a higher code; some cut off what is beyond."""
+_LEAST_STEP = 0.05
+"""Share of a linear display's step that is left of it between those codes where its gamma is 3."""
+_SURE_SHIFT_PX = 0.1
+"""Standard error up to which a movement counts as known."""
 
 Gray = Integer[np.ndarray, "h w"]
 Sample = Float32[np.ndarray, "pair 2 w"]
@@ -50,6 +58,8 @@ class Finding:
     """The frame that deviates most; None where the set doesn't tell which."""
     repeats: bool = False
     """Whether that frame shows what was shown before."""
+    even: bool = False
+    """Whether it is brighter or darker everywhere: as when a lamp is switched, not as when a pattern is late."""
 
 
 class FrameSample:
@@ -68,7 +78,7 @@ class FrameSample:
 def step_set(
     frames: Sequence[FrameSample],
     shifts_rad: Float[np.ndarray, "n"],
-    before: FrameSample | None = None,
+    before: Sequence[FrameSample | None] = (),
 ) -> Finding | None:
     r"""Judge four or more phase steps by what a sinusoid leaves of each frame; None where too little light moves.
 
@@ -79,7 +89,7 @@ def step_set(
     shifts_rad
         Phase shift of each, in [rad].
     before
-        The frame that was taken before the set, to tell a repeated picture.
+        What was exposed right before each frame, to tell a repeated picture; a marker may lie between two steps.
 
     Notes
     -----
@@ -130,7 +140,9 @@ class CommonPart:
     light: "_Light"
     frames: Sequence[FrameSample] = field(repr=False, default=())
 
-    def against(self, other: "CommonPart", before: FrameSample | None = None) -> Finding | None:
+    def against(
+        self, other: "CommonPart", before: Sequence[FrameSample | None] = ()
+    ) -> Finding | None:
         """Judge this set by another one of the same exposure; None where too little light moves."""
         valid = self.valid & other.valid
         light = max(self.light, other.light, key=lambda part: part.energy)
@@ -144,7 +156,8 @@ def same(frames: Sequence[FrameSample]) -> Finding | None:
     first = frames[0].gray
     light = _Light.of(valid, first)
     deviations = np.stack([f.gray - first for f in frames[1:]])
-    found = _judged(deviations, light, (), None, tell_frame=True)
+    found = _judged(deviations, light, (), (), tell_frame=True)
+    # Of uniform fields any other one is brighter or darker everywhere.
     return found and Finding(found.share, None if found.frame is None else found.frame + 1)
 
 
@@ -278,6 +291,101 @@ def drift(before: FrameSample, after: FrameSample, fields: Fields) -> float | No
     return float(change.mean()) / light
 
 
+def is_unchanged(
+    frame: FrameSample,
+    before: FrameSample,
+    codes: tuple[float, float],
+    fields: Fields,
+    exposure: float,
+) -> bool:
+    """Tell whether a gray field is as bright as the one before it, whose code is another.
+
+    Parameters
+    ----------
+    frame, before
+        Two fields, taken one after the other at the same exposure.
+    codes
+        Their codes, which differ: gray levels of the display in 0..255.
+    fields
+        White and black as they certainly are.
+    exposure
+        Exposure times gain of both.
+
+    Notes
+    -----
+    Every display with a gamma of 3 or less is brighter by at least a twentieth of what a linear one would be, between
+    codes 48 and 232. Beyond, some show the same; there the answer is no, as where noise or saturation hide the step.
+    """
+    low, high = _GRAYS_LIKELY
+    if not all(low <= code <= high for code in codes):
+        return False
+    use = fields.lit & frame.valid & before.valid & fields.white.valid
+    if int(np.count_nonzero(use)) < _LEAST_PIXELS:
+        return False
+    light = float((fields.white.gray - fields.black.gray)[use].mean()) * exposure / fields.exposure
+    least = _LEAST_STEP * abs(codes[0] - codes[1]) / 255 * light
+    difference = (frame.gray - before.gray)[use]
+    noise = float(difference.std()) / np.sqrt(difference.size)
+    return least > 4 * noise + 0.1 and abs(float(difference.mean())) < least / 2
+
+
+class Movement(NamedTuple):
+    """How a picture of the same light has changed from one moment to another."""
+
+    x_px: float
+    y_px: float
+    share: float
+    """What neither movement nor brightness explains, as a share of the light."""
+
+
+def movement(first: Fields, white: FrameSample, black: FrameSample | None) -> Movement | None:
+    r"""Tell by how much a picture has moved since white and black were exposed first.
+
+    Parameters
+    ----------
+    first
+        White and black then.
+    white, black
+        The same now; without black, what else lights the scene has to be what it was.
+
+    Returns
+    -------
+    movement
+        None where the scene is too even, or too noisy, to tell.
+
+    Notes
+    -----
+    To first order :math:`I' = (1 + g) I + c - s_x \partial_x I - s_y \partial_y I`, by least squares over lit pixels: exact
+    for a fraction of a pixel, and too small for more, which then is in what isn't explained.
+    """
+    valid = first.lit & first.white.valid & white.valid
+    before, after = first.white.gray, white.gray
+    if black is not None:
+        before, after = before - first.black.gray, after - black.gray
+    use = valid[..., 1:-1]
+    count = int(np.count_nonzero(use))
+    if count < _LEAST_PIXELS:
+        return None
+    across = (before[..., 2:] - before[..., :-2])[use] / 2
+    down = np.repeat(np.diff(before, axis=1), 2, axis=1)[..., 1:-1][use]
+    seen = before[..., 1:-1][use]
+    design = np.stack([-across, -down, seen, np.ones_like(seen)], axis=1).astype(np.float64)
+    change = (after - before)[..., 1:-1][use].astype(np.float64)
+    normal = design.T @ design
+    if np.linalg.matrix_rank(normal) < 4:
+        return None
+    solution = np.linalg.solve(normal, design.T @ change)
+    left = np.zeros(use.shape, np.float32)
+    left[use] = change - design @ solution
+    variance = float((left**2).sum(dtype=np.float64)) / count
+    error_px = np.sqrt(variance * np.diag(np.linalg.inv(normal))[:2].max())
+    if error_px > _SURE_SHIFT_PX:
+        return None
+    light = float((first.white.gray - first.black.gray)[..., 1:-1][use].mean())
+    unexplained = max(float((left[..., 1:] * left[..., :-1]).sum(dtype=np.float64)), 0.0) / count
+    return Movement(float(solution[0]), float(solution[1]), float(np.sqrt(unexplained)) / light)
+
+
 # ---------------------------------------------------------------- covariances of neighbours
 
 
@@ -311,7 +419,7 @@ def _judged(
     deviations: Float32[np.ndarray, "n pair 2 w"],
     light: _Light,
     frames: Sequence[FrameSample],
-    before: FrameSample | None,
+    before: Sequence[FrameSample | None],
     *,
     tell_frame: bool,
 ) -> Finding | None:
@@ -333,12 +441,14 @@ def _judged(
     shares = np.sqrt(np.maximum(found, 0.0) / known)
     worst, band = (int(i) for i in np.unravel_index(np.argmax(shares), shares.shape))
     share = float(shares[worst, band])
+    even = _is_even(deviations[worst], frames, light, band)
     if tell_frame:
-        return Finding(share, worst, _repeats(worst, frames, before, light, band))
+        repeats = _repeats(worst, frames, before, light, band)
+        return Finding(share, worst, repeats, even and not repeats)
     late = [k for k in range(len(frames)) if _repeats(k, frames, before, light, band)]
     if late:
         return Finding(share, late[0], repeats=True)
-    return Finding(share, _odd(frames, light, band))
+    return Finding(share, _odd(frames, light, band), even=even)
 
 
 def _row_sums(
@@ -420,18 +530,32 @@ def _bent(
 def _repeats(
     index: int,
     frames: Sequence[FrameSample],
-    before: FrameSample | None,
+    before: Sequence[FrameSample | None],
     light: _Light,
     band: int,
 ) -> bool:
     """Tell whether a frame shows the same as the one before it, where the deviation is largest."""
-    previous = frames[index - 1] if index > 0 else before
+    previous = before[index] if index < len(before) else None
     if previous is None or not frames or previous.gray.shape != frames[index].gray.shape:
         return False
     difference = _part(frames[index].gray - previous.gray, band)
     valid = _part(light.valid, band)
     found = _row_sums(difference[None], valid)[0].sum(axis=0).max() / max(valid.sum(), 1)
     return bool(found < _REPEATED**2 * light.energies[band])
+
+
+def _is_even(deviation: Sample, frames: Sequence[FrameSample], light: _Light, band: int) -> bool:
+    """Tell whether a deviation has one sign: whether it is correlated with how bright the scene is."""
+    if not frames:
+        return False
+    scene = np.mean([f.gray for f in frames], axis=0, dtype=np.float32)
+    valid = _part(light.valid, band)
+    a, b = (_part(p, band) * valid for p in (deviation, scene))
+    own, bright, both = (
+        float((one[..., :-1] * other[..., 1:]).sum(dtype=np.float64))
+        for one, other in ((a, a), (b, b), (a, b))
+    )
+    return own > 0 and bright > 0 and abs(both) > _EVEN * float(np.sqrt(own * bright))
 
 
 def _odd(frames: Sequence[FrameSample], light: _Light, band: int) -> int | None:

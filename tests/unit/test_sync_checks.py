@@ -73,9 +73,11 @@ def test_noise_and_a_bent_response_are_no_deviation(steps: int, noise: float, ga
 @pytest.mark.parametrize("steps", [4, 5, 8, 12])
 def test_a_wrong_frame_stands_out(steps: int, wrong: object) -> None:
     assert callable(wrong)
-    found = step_set(samples(wrong(steps_seen(steps))), shifts(steps))
+    frames = samples(wrong(steps_seen(steps)))
+    found = step_set(frames, shifts(steps), [None, *frames])
     assert found is not None
     assert found.share > 0.2
+    assert not found.even
     if wrong is not swapped:
         assert (found.frame, found.repeats) == (2, True)
 
@@ -106,7 +108,7 @@ def test_three_steps_are_compared_with_another_set() -> None:
     assert right.share < 0.02
     wrong = common_part(samples([sets[0][2], *sets[1][1:]]), shifts(3))
     assert wrong is not None
-    found = wrong.against(parts[0], before=samples([sets[0][2]])[0])
+    found = wrong.against(parts[0], before=samples([sets[0][2]]))
     assert found is not None
     assert found.share > 0.2
     assert (found.frame, found.repeats) == (0, True)
