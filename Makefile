@@ -11,6 +11,9 @@ JOBS ?= auto
 # Whoever has the development packages keeps them up to date, also for the demo.
 ENVIRONMENT := $(if $(wildcard $(VENV)/.python-dev),$(VENV)/.python-dev,$(VENV)/.python-run)
 
+# What one process has compiled the next one reads: the tests start dozens, and each worker imports everything.
+unexport PYTHONDONTWRITEBYTECODE
+
 .NOTPARALLEL:
 .PHONY: help demo test lint format bench lock
 
@@ -25,9 +28,10 @@ help:
 demo: $(VENV)/.system-run $(ENVIRONMENT) $(VENV)/.kernels
 	$(BIN)/unglare demo $(OPTIONS)
 
+# worksteal: tests of a file stay together, so that what they share is made once, not once per process.
 # The browser's tests run by themselves: its pictures are drawn by the processor, which others would keep busy.
 test: $(VENV)/.system-run $(VENV)/.system-test $(VENV)/.python-dev $(VENV)/.kernels
-	$(BIN)/pytest -m "not bench and not ui" --numprocesses=$(JOBS) --doctest-modules tests backend/domain backend/numerics $(OPTIONS)
+	$(BIN)/pytest -m "not bench and not ui" --numprocesses=$(JOBS) --dist=worksteal --doctest-modules tests backend/domain backend/numerics $(OPTIONS)
 	$(BIN)/pytest -m ui tests/ui $(OPTIONS)
 
 lint: $(VENV)/.python-dev

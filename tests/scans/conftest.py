@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from backend.jobs import shooting
 from backend.storage.artifacts import LocalArtifactStore
 from backend.storage.database import Database
 from tests.scans.toy_house import House, hurry, inline_house
@@ -16,6 +17,12 @@ def sqlite_database(sqlite_url: str) -> Iterator[Database]:
     with contextlib.closing(Database(sqlite_url)) as opened:
         hurry(opened)
         yield opened
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give a device that was lost a moment to come back, not as long as somebody takes to plug in a cable."""
+    monkeypatch.setattr(shooting, "RECONNECT_S", 0.2)
 
 
 @pytest.fixture

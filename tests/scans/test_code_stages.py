@@ -184,7 +184,7 @@ def test_a_fixed_threshold_loses_what_pattern_and_inverse_keep():
     assert told["dual"] >= told["delta"]
 
 
-def test_a_projector_that_does_not_answer_is_one_sentence_and_keeps_the_frames(tmp_path):
+def test_a_projector_that_does_not_answer_is_one_sentence_and_keeps_the_frames(tmp_path, impatient):
     options = {**PLANE, "size": "160x120", "projector_fail_after_shows": 30, "fail_for_good": True}
     with real_house(tmp_path) as services:
         scan = services.create_scan(CreateScan(method="adaptive-code", rig_options=options), "ada")

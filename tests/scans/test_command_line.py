@@ -1,5 +1,7 @@
 """The commands, run in this process: answers, sentences, exit statuses."""
 
+import contextlib
+import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -53,9 +55,31 @@ def unglare(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch) -> 
     return command
 
 
-def test_a_scan_answers_with_one_json_object(unglare, tmp_path):
-    done = unglare("scan", *SMALL, "--name", "first", "--out", tmp_path / "out", "--json")
-    assert done.status == 0, done.err
+@dataclass(frozen=True)
+class Scanned:
+    """A scan that a command has made, and where it has put everything."""
+
+    done: Done
+    data: Path
+    out: Path
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
+    """Scan once for all tests that only look at the result."""
+    folder = tmp_path_factory.mktemp("scanned")
+    data, out = folder / "data", folder / "out"
+    places = ["--data", str(data), "--out", str(out)]
+    with contextlib.redirect_stdout(io.StringIO()) as said, pytest.MonkeyPatch.context() as patch:
+        patch.delenv("UNGLARE_DATA_FOLDER", raising=False)
+        status = run(["scan", *SMALL, "--name", "first", "--frames", "--json", *places])
+    text = said.getvalue()
+    return Scanned(Done(status, text, "", json.loads(text.splitlines()[-1])), data, out)
+
+
+def test_a_scan_answers_with_one_json_object(scanned):
+    done = scanned.done
+    assert done.status == 0, done.answer
     assert len(done.out.splitlines()) == 1
     answer = done.answer
     assert answer["status"] == "finished"
@@ -71,8 +95,8 @@ def test_a_scan_answers_with_one_json_object(unglare, tmp_path):
     assert answer["truth"]["completeness"] > 0.9
     assert set(answer["parts"]["plane"]) >= {"completeness", "outlier_share", "rms_mm", "median_mm"}
     assert all(Path(file).is_file() for file in answer["files"])
-    assert len(read_ply(tmp_path / "out/cloud.ply")["x"]) == answer["points"]
-    assert (tmp_path / "out/maps/fringe_phase.projector_px.left.npy").is_file()
+    assert len(read_ply(scanned.out / "cloud.ply")["x"]) == answer["points"]
+    assert (scanned.out / "maps/fringe_phase.projector_px.left.npy").is_file()
 
 
 def test_calibrations_are_listed_and_what_is_not_there_is_named(unglare):
@@ -85,16 +109,15 @@ def test_calibrations_are_listed_and_what_is_not_there_is_named(unglare):
     assert (done.status, "hdr-fringe takes no Ramp from outside" in done.err) == (1, True)
 
 
-def test_an_exported_scan_is_imported_with_the_same_cloud_and_replayed(unglare, tmp_path):
-    scanned = unglare("scan", *SMALL, "--out", tmp_path / "out", "--frames", "--json").answer
-    elsewhere = ("--data", tmp_path / "elsewhere")
-    done = unglare("import", tmp_path / "out/capture.json", *elsewhere, "--json")
+def test_an_exported_scan_is_imported_with_the_same_cloud_and_replayed(unglare, scanned):
+    first = scanned.done.answer
+    done = unglare("import", scanned.out / "capture.json", "--json")
     assert done.status == 0, done.err
-    hashes = [[s["result_hash"] for s in a["stages"]] for a in (scanned, done.answer)]
+    hashes = [[s["result_hash"] for s in a["stages"]] for a in (first, done.answer)]
     assert hashes[0] == hashes[1]
-    assert done.answer["points"] == scanned["points"]
-    for target in (tmp_path / "out", scanned["scan"]):
-        replayed = unglare("replay", target, "--json")
+    assert done.answer["points"] == first["points"]
+    for target in (scanned.out, first["scan"]):
+        replayed = unglare("replay", target, "--data", scanned.data, "--json")
         assert replayed.status == 0, replayed.err
         assert replayed.answer["same"]
 
@@ -119,9 +142,9 @@ def test_a_scan_is_summed_up_for_people(unglare):
     assert "Traceback" not in done.out + done.err
 
 
-def test_an_old_scan_is_exported(unglare, tmp_path):
-    scan = unglare("scan", *SMALL, "--json").answer["scan"]
-    done = unglare("export", scan, "--out", tmp_path / "out", "--json")
+def test_an_old_scan_is_exported(unglare, scanned, tmp_path):
+    scan = scanned.done.answer["scan"]
+    done = unglare("export", scan, "--data", scanned.data, "--out", tmp_path / "out", "--json")
     assert done.status == 0, done.err
     assert str(tmp_path / "out/cloud.ply") in done.answer["files"]
 
@@ -176,7 +199,7 @@ def test_a_place_that_holds_other_things_is_refused_before_anything_is_captured(
     assert "scan" not in done.answer
 
 
-def test_a_rig_that_fails_loses_nothing(unglare):
+def test_a_rig_that_fails_loses_nothing(unglare, impatient):
     fault = ("--rig-option", "fail_after_frames=8", "--rig-option", "fail_for_good=true")
     done = unglare("scan", *SMALL, *fault, "--json", "--quiet")
     assert done.status == 1
@@ -253,7 +276,7 @@ def test_a_healthy_rig_has_no_problems(unglare):
         ("projector_fail_after_shows=0", "projector"),
     ],
 )
-def test_a_rigs_problem_is_named(unglare, option, words):
+def test_a_rigs_problem_is_named(unglare, impatient, option, words):
     done = unglare(
         "rigs",
         "check",
