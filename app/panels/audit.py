@@ -13,6 +13,7 @@ from backend.contract.scans import AuditEntry, ScanState
 _TONES = {
     "accepted": "accepted", "rejected": "rejected", "failed": "failed", "cancelled": "rejected", "edited": "awaiting_review",
     "undone": "awaiting_review", "redone": "awaiting_review", "finished": "done", "run": "running", "created": "given",
+    "unverified": "failed",
 }  # fmt: skip
 _MOST = 200
 

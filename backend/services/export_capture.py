@@ -1,6 +1,6 @@
 """The captured frames of a scan in the import format: `capture.json`, pictures, masks."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -19,11 +19,12 @@ from backend.contract.capture import (
 from backend.domain.method import Method
 from backend.domain.rig import CameraFacts, PinholeModel, Pose, RigCalibration, RigFacts
 from backend.domain.shots import Progress
+from backend.jobs.evidence import evidence_of
 from backend.numerics.pinhole import RigidTransform, compose, inverse
 from backend.services.capture_calibration import PROJECTOR
 from backend.services.export_folder import Array, ExportFolder, safe_name
 from backend.storage.artifacts import ArtifactStore
-from backend.storage.rows import FrameRow, GivenRow
+from backend.storage.rows import AuditRow, FrameRow, GivenRow
 
 _PNG_LEVEL = 1
 """Noise doesn't compress: the higher levels take ten times as long for a few per cent."""
@@ -90,6 +91,31 @@ def write_capture(
     folder.write_json(
         "capture.json", capture.model_dump(mode="json", by_alias=True, exclude_none=True)
     )
+
+
+def write_evidence(folder: ExportFolder, store: ArtifactStore, audit: Sequence[AuditRow]) -> None:
+    """Write frames that couldn't be verified beside the capture: pictures, and `unverified.json` that says what they are.
+
+    Nothing imports them.
+    """
+    failures = []
+    for n, (row, frames) in enumerate(evidence_of(audit)):
+        files = []
+        for number, frame in enumerate(frames):
+            name = f"unverified/{n:02d}/{safe_name(frame['camera'])}/{number:04d}.png"
+            folder.write(name, (_png(store.get(frame["artifact"])),))
+            told = {key: value for key, value in frame.items() if key != "artifact"}
+            files.append({"file": name, **told})
+        failures.append(
+            {
+                "stage": row.stage,
+                "when": row.when.isoformat(),
+                "reason": row.sentence,
+                "frames": files,
+            }
+        )
+    if failures:
+        folder.write_json("unverified.json", failures)
 
 
 def _journalled(journal: tuple[FrameRow, ...]) -> Iterator[_Picture]:

@@ -23,9 +23,10 @@ from backend.domain.errors import ConflictError
 from backend.domain.method import Wire
 from backend.domain.rig import RigCalibration, RigFacts
 from backend.domain.shots import Progress
+from backend.jobs.evidence import evidence_of
 from backend.jobs.loading import LoadedScan, document_of, load_scan
 from backend.services.context import Context
-from backend.services.export_capture import write_capture
+from backend.services.export_capture import write_capture, write_evidence
 from backend.services.export_folder import (
     SCAN_FILE,
     Array,
@@ -63,7 +64,8 @@ def export_scan(
     `scan.json` (how the scan came about, see `contract.scan_file`), `cloud.ply`,
     the method's own files, `maps/<stage>.<field>[.<camera>].npy` for every shown map,
     `arrays/` for what settings refer to, and with `frames` the captured frames in the
-    import format, so that importing the folder gives the same results again. The folder appears whole or not
+    import format, so that importing the folder gives the same results again; frames that
+    couldn't be verified go to `unverified/`, which nothing imports. The folder appears whole or not
     at all; an older export in its place is replaced.
 
     Raises
@@ -164,7 +166,8 @@ class _Content:
     def has_frames(self) -> bool:
         """True if something was captured or imported."""
         imported = set(self.given) & set(self.loaded.method.importers)
-        return self.facts is not None and bool(self.journal or imported)
+        unverified = any(evidence_of(self.audit))
+        return self.facts is not None and bool(self.journal or imported or unverified)
 
     @property
     def given(self) -> Mapping[str, GivenRow]:
@@ -296,6 +299,7 @@ def _write_frames(
         given=content.given,
         progress=progress,
     )
+    write_evidence(target, store, content.audit)
 
 
 def _write_arrays(target: ExportFolder, content: _Content, store: ArtifactStore) -> dict[str, str]:
