@@ -126,11 +126,12 @@ def mark_extremes(gray: Gray, bits: int, *, max_px: int) -> UInt8[np.ndarray, "h
     height, width = gray.shape
     share = min(1.0, max_px / max(height, width))
     size = max(1, round(width * share)), max(1, round(height * share))
-    level = cv2.convertScaleAbs(gray, alpha=255.0 / (2**bits - 1))
-    rgb = cv2.cvtColor(cv2.resize(level, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2RGB)
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    rgb = cv2.cvtColor(cv2.convertScaleAbs(small, alpha=255.0 / (2**bits - 1)), cv2.COLOR_GRAY2RGB)
     for lowest, highest, colour in ((0, 0, _BLUE), (2**bits - 2, 2**bits - 1, _RED)):
         mask = cv2.inRange(gray, lowest, highest)
-        rgb[cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0] = colour
+        if cv2.countNonZero(mask):  # making it smaller takes longest
+            rgb[cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0] = colour
     return np.asarray(rgb, np.uint8)
 
 
