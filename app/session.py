@@ -231,7 +231,8 @@ class Session:
         self.load(lambda: self._inspect(camera), key="inspect")
 
     def leave_inspection(self) -> None:
-        """Show the scene again."""
+        """Show the scene again; on a rig's page, put the magnifier away."""
+        self._rig_desk.leave_part()
         self._left_by_hand = self._look.scan.id if self._look is not None else ""
         self.load(self._leave_inspection, key="inspect")
 

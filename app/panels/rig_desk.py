@@ -109,6 +109,10 @@ class RigDeskPanel:
         if rig == self.rig:
             self._looks = 0
 
+    def leave_part(self) -> None:
+        """Put the magnifier away."""
+        self._focus.put_away()
+
     def click(self, origin: Any, direction: Any) -> None:
         """Choose the place of a picture that is looked at pixel by pixel."""
         place = self._planes.place_of(origin, direction)

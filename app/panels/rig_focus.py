@@ -50,7 +50,7 @@ class FocusPanel:
     def forget(self) -> None:
         """Another rig, or none: what was best doesn't count any more."""
         self._start_anew()
-        self._put_away()
+        self.put_away()
         self._chart.clear()
 
     def show(self, live: LiveView, cameras: list[str]) -> None:
@@ -75,7 +75,7 @@ class FocusPanel:
         self._part_aid = SharpnessAid()
         self._planes.mark(camera, x, y, _PART_PX)
         close = self._desk.clicks.label(
-            "leave part", self._put_away, "✕ close", "ug-link", "Put it away"
+            "leave part", self.put_away, "✕ close", "ug-link", "Put it away"
         )
         title = markup.span("ug-name", markup.esc(f"{camera}, pixel {x}, {y}"))
         self._part_head.content = markup.div("ug-caption ug-pixel", title + close)
@@ -124,7 +124,8 @@ class FocusPanel:
     def _aid(self, camera: str) -> SharpnessAid:
         return self._aids.setdefault(camera, SharpnessAid())
 
-    def _put_away(self) -> None:
+    def put_away(self) -> None:
+        """Hide the magnified part."""
         self._place = None
         self._planes.unmark()
         self._panel.visible = False
