@@ -356,8 +356,8 @@ class Session:
             self._scan.visible = self._scan_panel.visible = True
 
     def _open_rig(self, rig: str, options: dict[str, Any] | None) -> None:
-        if options is None:
-            options = self._new_scan.options_of(rig) if self._new_scan is not None else {}
+        if options is None and self._new_scan is not None:
+            options = self._new_scan.options_of(rig)
         self._look = None
         with self._client.atomic():
             self._home.visible = self._list_panel.visible = False

@@ -149,6 +149,10 @@ class Form:
         if setting.kind in ("choice", "switch"):
             return dict(zip(_texts(setting), _values(setting), strict=True))[shown]
         if setting.typed:
+            present = row.view.value
+            if present is not None and shown == write(setting, present, row.view.chosen):
+                # It has more digits than its text.
+                return list(present) if isinstance(present, tuple) else present
             return read(setting, shown, row.view.chosen)
         return int(shown) if setting.kind == "integer" else float(shown)
 

@@ -147,10 +147,10 @@ class NewScanPanel:
         except UnreadableError:
             return None
 
-    def options_of(self, rig: str) -> dict[str, Any]:
-        """Return the options chosen for a rig; none if another one is chosen."""
+    def options_of(self, rig: str) -> dict[str, Any] | None:
+        """Return the options chosen for a rig; None if another one is chosen."""
         chosen = self.chosen_rig()
-        return chosen[1] if chosen is not None and chosen[0] == rig else {}
+        return chosen[1] if chosen is not None and chosen[0] == rig else None
 
     def _set_up_link(self) -> str:
         words = "set up this rig: live pictures, light, focus, latency ›"

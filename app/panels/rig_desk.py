@@ -8,6 +8,7 @@ import viser
 from app import markup
 from app.client import ApiError
 from app.desk import Desk
+from app.numbers import heading, quantity
 from app.panels.rig_devices import DevicesPanel
 from app.panels.rig_focus import FocusPanel
 from app.panels.rig_light import LightPanel
@@ -75,8 +76,11 @@ class RigDeskPanel:
 
     # ---- what the session asks for
 
-    def open(self, rig: str, offers: tuple[RigOffer, ...], options: dict[str, Any]) -> None:
-        """Show a rig; an operator's look connects it."""
+    def open(self, rig: str, offers: tuple[RigOffer, ...], options: dict[str, Any] | None) -> None:
+        """Show a rig; an operator's look connects it.
+
+        One that is open with other options is opened with these, unless somebody captures; None: it stays as it is.
+        """
         with self._lock:
             self._state, self._looks, self._numbers = None, 0, {}
             self._wants_live = True
@@ -88,7 +92,7 @@ class RigDeskPanel:
             self._poll.turn_to(rig)
         error = next((offer.error for offer in offers if offer.name == rig), None)
         if error is None and self._desk.who.may_operate:
-            self.do(lambda: self._desk.api.connect(rig, options))
+            self.do(lambda: self._connected(rig, options))
 
     def close(self) -> None:
         """Leave the page, if it is on the screen."""
@@ -190,6 +194,14 @@ class RigDeskPanel:
                 self._planes.clear()
                 self._numbers = {}
 
+    def _connected(self, rig: str, options: dict[str, Any] | None) -> RigState:
+        api = self._desk.api
+        state = api.rig_state(rig)
+        is_idle = state.link is RigLink.OPEN and state.owner is None
+        if is_idle and options is not None and options != state.options:
+            api.disconnect(rig)
+        return api.connect(rig, options or {})
+
     def _set_live(self, settings: LiveSettings) -> None:
         rig, state = self.rig, self._state
         if rig is None:
@@ -230,9 +242,15 @@ class RigDeskPanel:
 
 
 def _purpose(state: RigState) -> str:
-    simple = {k: v for k, v in state.options.items() if isinstance(v, (str, int, float, bool))}
-    words = ", ".join(f"{name} {value}" for name, value in simple.items())
+    words = ", ".join(_option(name, value) for name, value in state.options.items())
     return words or "Rig without a scan: light, exposure, focus, latency"
+
+
+def _option(name: str, value: Any) -> str:
+    words, unit = heading(name)
+    if isinstance(value, (list, tuple)):
+        value = " × ".join(map(str, value))
+    return f"{words} {quantity(value, unit) if not isinstance(value, dict) else '…'}"
 
 
 def _raising(error: Exception) -> Work:

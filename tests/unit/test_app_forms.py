@@ -1,5 +1,6 @@
 """From JSON schemas to controls and back."""
 
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import pytest
@@ -7,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
+from app.forms.form import Form
 from app.forms.schema import Setting, UnreadableError, read, read_schema, write
 from backend.domain.params import Params, setting
 
@@ -127,3 +129,30 @@ def test_leaving_an_automatic_value_alone_keeps_it_automatic(chosen: float) -> N
     number = Setting("x", "x", "number", optional=True)
 
     assert read(number, write(number, None, chosen), chosen) is None
+
+
+class _Controls:
+    """Makes text controls as viser does, without a browser."""
+
+    def __init__(self) -> None:
+        self.texts: list[Any] = []
+
+    def add_html(self, content: str, **_: Any) -> SimpleNamespace:
+        return SimpleNamespace(content=content, visible=True)
+
+    def add_text(self, label: str, value: str, **_: Any) -> SimpleNamespace:
+        self.texts.append(SimpleNamespace(value=value, on_update=lambda changed: changed))
+        made: SimpleNamespace = self.texts[-1]
+        return made
+
+
+def test_what_nobody_touches_keeps_all_its_digits() -> None:
+    gui: Any = _Controls()
+    period = Setting("period_ms", "Period", "number", default=1000 / 120, optional=True)
+    size = Setting("size", "Size", "numbers", default=(1280, 960))
+    form = Form(gui, (period, size), on_edit=lambda *_: None, on_error=lambda *_: None)
+
+    assert gui.texts[0].value == "8.333"
+    assert form.values() == {"period_ms": 1000 / 120, "size": [1280, 960]}
+    gui.texts[0].value = "8.4"
+    assert form.values()["period_ms"] == 8.4
