@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from backend.devices.errors import RigConfigError
+from backend.devices.foreign import is_ours, misfit
 from backend.devices.options import meant, shortened
 from backend.devices.pages import PageDesk
 from backend.devices.plug_ins import (
@@ -47,7 +48,7 @@ _REQUIRED = {
     CAMERAS: (*_DEVICE, "settings", "configure", "arm", "trigger", "get_frame", "disarm", "abort"),
     PROJECTORS: (*_DEVICE, "load", "show", "blank"),
 }
-_PROTOCOLS = {CAMERAS: "Camera", PROJECTORS: "Projector"}
+_PROTOCOLS: dict[str, type] = {CAMERAS: Camera, PROJECTORS: Projector}
 
 
 @dataclass(frozen=True)
@@ -163,6 +164,12 @@ def _made(group: str, name: str, driver: str, options: Mapping[str, Any], **more
     if missing:
         raise RigConfigError(
             f"{name}: driver {driver} made a {type(made).__name__} without {missing}; see"
-            f" backend.devices.protocols.{_PROTOCOLS[group]}"
+            f" backend.devices.protocols.{_PROTOCOLS[group].__name__}"
+        )
+    problem = "" if is_ours(made) else misfit(made, _PROTOCOLS[group])
+    if problem:
+        raise RigConfigError(
+            f"{name}: driver {driver} made a {type(made).__name__} whose {problem}; see"
+            f" backend.devices.protocols.{_PROTOCOLS[group].__name__}"
         )
     return made

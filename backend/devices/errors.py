@@ -52,6 +52,10 @@ class DeviceStalled(DeviceError):
     """The driver doesn't return from a call. The scan ends, the rig is opened anew with the next one."""
 
 
+class DriverFailed(DeviceError):
+    """A driver from outside raised what it shouldn't, or isn't what its protocol says. Mend or update it."""
+
+
 class FeatureError(DeviceError, ValueError):
     """A setting is out of range, not one of the choices, or locked; the sentence names what is allowed."""
 

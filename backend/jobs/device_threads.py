@@ -12,10 +12,12 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NoReturn, TypeVar
 
 from backend.devices.errors import DeviceStalled
+from backend.devices.foreign import failure, is_ours
 from backend.devices.protocols import Camera, Device, KnowsItsPace
+from backend.domain.errors import UnglareError
 from backend.jobs.control import JobControl
 
 log = logging.getLogger(__name__)
@@ -217,9 +219,9 @@ class DeviceThreads:
         overdue = [call for call in calls if not call.future.done()]
         for call in overdue:
             self._give_up(call)
-        errors = [error for call in calls if (error := _error_of(call)) is not None]
+        errors = [(call, error) for call in calls if (error := _error_of(call)) is not None]
         if errors:
-            raise errors[0]
+            self._raise(*errors[0])
         return {call.device: call.future.result() for call in calls}
 
     def leave(self, error: Exception, close: Callable[[], None]) -> "tuple[Future[None], ...]":
@@ -251,6 +253,13 @@ class DeviceThreads:
                 left_s = min(left_s, stopped_s + grace_s - time.monotonic())
             if wait([call.future], timeout=max(0.0, min(left_s, _LOOK_S))).done or left_s <= 0:
                 return
+
+    def _raise(self, call: DriverCall[T], error: BaseException) -> NoReturn:
+        """Raise what came of a call; what a driver from outside shouldn't have raised gets its device's name."""
+        foreign = not is_ours(self._devices[call.device])
+        if foreign and isinstance(error, Exception) and not isinstance(error, UnglareError):
+            raise failure(call.device, call.doing, error) from error
+        raise error
 
     def _give_up(self, call: DriverCall[T]) -> None:
         self._stuck[call.device] = call

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from backend.devices.errors import DeviceDisconnected, DeviceError, DeviceStalled
+from backend.devices.foreign import refuse_other_frame
 from backend.devices.protocols import (
     Camera,
     CameraSettings,
@@ -363,7 +364,9 @@ def _expose(camera: Camera) -> Frame:
         camera.trigger()
     for _ in range(_thrown_away(camera)):
         camera.get_frame(FRAME_TIMEOUT_S)
-    return camera.get_frame(FRAME_TIMEOUT_S)
+    frame = camera.get_frame(FRAME_TIMEOUT_S)
+    refuse_other_frame(camera.name, frame)
+    return frame
 
 
 def disarm(camera: Camera) -> None:
