@@ -121,7 +121,7 @@ class DevicesPanel:
         def look(request: DiscoverCameras) -> None:
             found.content = markup.div("ug-text ug-doc", "Looking …")
             try:
-                found.content = found_html(self._desk.api.discover(request), request.addresses)
+                found.content = found_html(self._desk.api.discover(request))
             except Exception:
                 found.content = ""
                 raise
@@ -141,17 +141,11 @@ def cards(state: RigState) -> list[tuple[DeviceView, str]]:
     return [(d, _projector_note(state) if d.role == "projector" else "") for d in state.devices]
 
 
-def found_html(found: Discovery, asked: tuple[str, ...] = ()) -> str:
-    """Say which cameras answered, and which of the addresses that were asked didn't."""
+def found_html(found: Discovery) -> str:
+    """Say which cameras answered, and why others didn't."""
     problems = "".join(markup.div("ug-why", markup.esc(p)) for p in found.problems)
-    silent = [a for a in asked if a not in {camera.address for camera in found.cameras}]
-    if silent:
-        words = f"No camera answered at {', '.join(silent)}: check cable, power and subnet."
-        problems += markup.div("ug-why", markup.esc(words))
-    if not found.cameras and silent:
-        return problems
     if not found.cameras:
-        return problems + markup.div("ug-text ug-doc", "No camera answered.")
+        return problems or markup.div("ug-text ug-doc", "No camera answered.")
     return problems + markup.div("ug-devices", "".join(map(_found_card, found.cameras)))
 
 

@@ -64,7 +64,7 @@ def discover(
         if not as_json:
             _show(found)
     for address in answer["silent"]:
-        complain(f"no camera answers at {address}; check cable, power and the address")
+        complain(discovery.why_silent(address))
     for problem in problems:
         complain(problem)
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from backend.devices.driver_loading import CAMERAS, available_drivers, load_factory
+from backend.devices.drivers import gige_link
 from backend.devices.errors import RigConfigError
 from backend.devices.found import FoundCamera
 from backend.devices.options import is_single_address
@@ -107,6 +108,12 @@ def ask_known(
     places = known_addresses(shelf)
     found = ask_addresses(list(addresses or places), timeout_s)
     return tuple(replace(camera, used_in=places.get(camera.address, ())) for camera in found)
+
+
+def why_silent(address: str) -> str:
+    """Say that no camera answers at an address, and what to do about it: half a sentence more where it can't be reached."""
+    elsewhere = gige_link.wrong_network(address, gige_link.content_of(gige_link.ROUTES))
+    return f"no camera answers at {address}; {elsewhere or 'check cable, power and the address'}"
 
 
 def search(drivers: Sequence[str] | None = None) -> SearchResult:

@@ -26,7 +26,7 @@ from backend.contract.rigs import (
     RigState,
     RigWork,
 )
-from backend.devices.discovery import ask_addresses, ask_known, search
+from backend.devices.discovery import ask_addresses, ask_known, search, why_silent
 from backend.devices.found import FoundCamera
 from backend.devices.protocols import CameraCapabilities, ProjectorCapabilities
 from backend.domain.errors import ConflictError, InvalidSettingError, NotFoundError
@@ -132,11 +132,13 @@ class RigDesk:
             cameras = (
                 ask_known(shelf, request.addresses) if shelf else ask_addresses(request.addresses)
             )
+            answered = {camera.address for camera in cameras}
+            problems = tuple(f"{why_silent(a)}." for a in request.addresses if a not in answered)
         if request.search:
             searched = search()
             known = {(c.driver, c.address, c.serial) for c in cameras}
             more = [c for c in searched.cameras if (c.driver, c.address, c.serial) not in known]
-            cameras, problems = (*cameras, *more), searched.problems
+            cameras, problems = (*cameras, *more), (*problems, *searched.problems)
         return Discovery(cameras=tuple(map(_found, cameras)), problems=problems)
 
     # ---- live pictures

@@ -14,7 +14,13 @@ import pytest
 from backend.cli.application import run
 from backend.devices import discovery
 from backend.devices.discovery import ask_addresses, ask_known, controller_of, known_addresses
-from backend.devices.drivers import aravis_camera, gentl_camera, pylon_camera, video_camera
+from backend.devices.drivers import (
+    aravis_camera,
+    gentl_camera,
+    gige_link,
+    pylon_camera,
+    video_camera,
+)
 from backend.devices.drivers.aravis_library import AravisMissingError, Listed
 from backend.devices.found import FoundCamera
 from backend.devices.pages import PageDesk
@@ -293,7 +299,7 @@ def test_the_command_asks_the_addresses_of_the_rig_files(discover, tmp_path, cam
     assert status == 0
     for word in (cameras[0], "SIM-L", "nobody", "bench: camera-0", "{driver: aravis, address:"):
         assert word in out
-    assert f"no camera answers at {nobody}" in err
+    assert f"no camera answers at {nobody}; check cable, power and the address" in err
 
 
 def test_the_commands_document_has_everything(discover, cameras):
@@ -338,3 +344,14 @@ def test_searching_is_only_done_when_asked_for(discover, monkeypatch, cameras):
     for word in ("Basler a2A (1)", "not known", "{driver: pylon, serial: '1'}"):
         assert word in out
     assert "gentl: it isn't installed" in err
+
+
+def test_an_address_of_another_network_is_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    routes = tmp_path / "route"
+    heads = "Iface Destination Gateway Flags RefCnt Use Metric Mask"
+    routes.write_text(f"{heads}\neth0 000200C0 00000000 0001 0 0 0 00FFFFFF\n")
+    monkeypatch.setattr(gige_link, "ROUTES", routes)
+    assert "give the card that the camera is plugged into" in discovery.why_silent("10.1.2.3")
+    assert discovery.why_silent("192.0.2.9").endswith("check cable, power and the address")
