@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Locator, expect
 
 from backend.api.sessions import Role
 from backend.jobs.rigs import Owner
-from backend.services import latency
+from backend.services import latency, latency_bench, latency_triggered
 from tests.ui.bench_served import Bench, serve_bench
 from tests.ui.browser import PATIENCE_MS, Desk
 from tests.ui.conftest import open_desk
@@ -25,7 +25,8 @@ def _patience() -> None:
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(latency, "_STEADY_S", 0.06)
+        for module in (latency_bench, latency_triggered):
+            patch.setattr(module, "STEADY_S", 0.06)
         with serve_bench() as running:
             yield running
 
@@ -65,11 +66,11 @@ def mean_gray(page: Desk, camera: str = "left") -> float:
 
 def wait_for(page: Desk, condition: Any) -> None:
     """Wait for what the page tells sooner or later."""
-    for _ in range(300):
+    for _ in range(PATIENCE_MS // 100):
         if condition():
             return
         page.page.wait_for_timeout(100)
-    raise AssertionError("it didn't happen within 30 s")
+    raise AssertionError(f"it didn't happen within {PATIENCE_MS} ms")
 
 
 def set_exposure(page: Desk, text: str, shown: str) -> None:
@@ -95,6 +96,28 @@ def test_a_typed_exposure_snaps_and_moves_the_levels(page: Desk) -> None:
     set_exposure(page, "35", "33.33")
     expect(page.page.locator(".ug-setting-note", has_text="2 periods of 16.67 ms")).to_be_visible()
     wait_for(page, lambda: mean_gray(page) > 1.7 * before)
+
+
+def test_what_was_typed_survives_a_click_right_after_it(page: Desk) -> None:
+    set_exposure(page, "17", "16.67")
+    page.control("Exposure [ms]").fill("60")
+    pattern(page, "squares").click()
+    expect(pattern(page, "squares")).to_have_class(re.compile("ug-on"))
+    expect(card(page, "left").locator(".ug-note")).to_have_text("66.67 ms")
+    expect(page.control("Exposure [ms]")).to_have_value("66.67")
+    expect(pattern(page, "squares")).to_have_class(re.compile("ug-on"))
+    pattern(page, "white").click()
+
+
+def test_an_exposure_is_searched(page: Desk) -> None:
+    pattern(page, "white").click()
+    set_exposure(page, "200", "200")
+    auto = page.page.locator("label.ug-link", has_text=re.compile("^auto$"))
+    auto.click()
+    expect(auto).to_be_hidden()
+    expect(auto).to_be_visible()
+    expect(card(page, "left").locator("b").nth(1)).to_have_text("0 %")
+    assert 16 < float(page.control("Exposure [ms]").input_value()) < 50
 
 
 def test_a_pattern_is_projected_and_seen(bench: Bench, page: Desk) -> None:
@@ -131,6 +154,9 @@ def test_a_click_magnifies_a_part(page: Desk) -> None:
     assert box is not None
     page.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 4)
     expect(page.page.locator(".ug-pixel", has_text="left, pixel")).to_be_visible()
+    sharp = page.page.locator(".ug-sharp .ug-value")
+    expect(sharp).to_have_count(3)
+    expect(sharp.filter(has_text="% of best")).to_have_count(3)
     page.page.locator("label.ug-link", has_text="close").filter(visible=True).click()
     expect(page.page.get_by_text("Magnifier")).to_be_hidden()
 
