@@ -249,7 +249,7 @@ def _purpose(state: RigState) -> str:
 def _option(name: str, value: Any) -> str:
     words, unit = heading(name)
     if isinstance(value, (list, tuple)):
-        value = " × ".join(map(str, value))
+        value = " × ".join(f"{v:g}" if isinstance(v, (int, float)) else str(v) for v in value)
     return f"{words} {quantity(value, unit) if not isinstance(value, dict) else '…'}"
 
 
