@@ -37,7 +37,6 @@ from backend.devices.peers.dlpc350 import SimulatedDlpc350, load_ms
 from backend.devices.protocols import Frame, LinkState, Rig, SequenceProjector, TriggerSource
 from backend.devices.rig_shelf import RigShelf
 from backend.domain.patterns import Gray, Sine, Uniform
-from backend.domain.rig import PinholeModel, Pose, RigCalibration
 from backend.jobs.rendering import render
 from tests.lightcrafter_hardware import lightcrafter_hardware
 
@@ -126,14 +125,14 @@ def projector(device, folder) -> Iterator[Dlpc350Projector]:
 def shows(bench: Bench, wanted: np.ndarray) -> bool:
     """Wait for a picture to come to light."""
     with bench.changed:
-        return bench.changed.wait_for(lambda: np.array_equal(bench.picture, wanted), timeout=5)
+        return bench.changed.wait_for(lambda: np.array_equal(bench.picture, wanted), timeout=60)
 
 
 def ran(device: SimulatedDlpc350) -> None:
     """Wait until a sequence is over."""
     player = device._player
     if player is not None:
-        player.join(timeout=10)
+        player.join(timeout=60)
 
 
 # ---------------------------------------------------------------- sequences
@@ -639,21 +638,6 @@ def test_a_measured_latency_is_waited_for(tmp_path, folder):
         assert _settle_ms(shelf) == (25.0 if holds else None), "measured with another period"
 
 
-@pytest.mark.parametrize(("rows", "refused"), [(3000.0, False), (1500.0, True)])
-def test_a_projector_model_for_square_pixels_is_refused(projector, rows, refused):
-    K = np.array([[1500.0, 0, WIDTH / 2], [0, rows, HEIGHT / 2], [0, 0, 1]])
-    model = PinholeModel(WIDTH, HEIGHT, K, np.zeros(5))
-    known = RigCalibration(
-        {}, {}, "left", projector=model, projector_from_world=Pose(np.eye(3), np.zeros(3))
-    )
-    rig = AssembledRig("bench", {}, projector, sensors={}, calibration=known)
-    if refused:
-        with pytest.raises(RigConfigError, match="its columns are twice as far apart as its rows"):
-            rig._refuse_square_pixels()
-    else:
-        rig._refuse_square_pixels()
-
-
 def test_a_later_image_is_loaded_while_the_one_before_it_is_shown(tmp_path):
     """Of four images the second is there from the beginning, however shortly the first one is shown."""
     random = np.random.default_rng(1)
@@ -783,5 +767,5 @@ def test_stopping_from_another_thread_ends_a_sequence(projector, device):
     projector.start_sequence()
     stopping = threading.Thread(target=projector.stop_sequence)
     stopping.start()
-    stopping.join(timeout=5)
+    stopping.join(timeout=60)
     assert device._action is Action.STOP
