@@ -18,6 +18,7 @@ from backend.domain.shots import Shot
 from backend.domain.states import Level
 from backend.jobs.sync_look import (
     FIELD_RANGE,
+    NO_DRIFT,
     SET_LIMIT,
     Cause,
     Findings,
@@ -25,6 +26,7 @@ from backend.jobs.sync_look import (
     Look,
     Violation,
     exposure_of,
+    is_light,
     nearest,
     sample_of,
 )
@@ -32,8 +34,6 @@ from backend.jobs.sync_sets import Planned, Unit, Witness, marked_again, units_o
 from backend.numerics.sync_checks import Fields, FrameSample, Movement, drift, movement
 
 DRIFT_LIMIT = 0.02
-NO_DRIFT = 0.3
-"""No lamp changes by that much within a stage: the display shows something else."""
 MOVED_LIMIT_PX = 0.3
 """What moves by less costs less than the fringes' noise; a rig that warms up moves by a tenth of a pixel."""
 CHANGED_LIMIT = 0.15
@@ -68,8 +68,6 @@ class SyncWatch:
         self._known = Known()
         self._lights: dict[str, dict[float, Shot]] = {}
         """Shots with whose exposure and gain white and black were planned, by camera and exposure."""
-        self._changed: set[str] = set()
-        """Cameras for which the light isn't what it was when a stage began."""
         self._whites: dict[str, FrameSample] = {}
         """White at the end of a stage."""
         self.findings = Findings()
@@ -166,11 +164,6 @@ class SyncWatch:
         for camera in dict.fromkeys(c for planned in unit.planned for c in planned.cameras):
             look = Look(self._known, camera, unit, frames, burst, found)
             violation = look.judge()
-            if look.change is not None:
-                # What is compared from now on is what was seen under the light of now.
-                self._known.forget(camera)
-                if _is_light(*look.change):
-                    self._changed.add(camera)
             if violation is not None:
                 alone = self._others_are_right(camera, unit, frames, burst)
                 return replace(violation, cause=Cause.CAMERA) if alone else violation
@@ -214,7 +207,7 @@ class SyncWatch:
             return Cause.STILL
         if Cause.DISPLAY in causes:
             return Cause.DISPLAY
-        changed = any(violation.camera in self._changed for violation in violations)
+        changed = any(violation.camera in self._known.changed for violation in violations)
         return Cause.LIGHT if changed or Cause.LIGHT in causes else Cause.UNKNOWN
 
     def judge_white(self, frames: Mapping[str, Frame]) -> None:
@@ -278,13 +271,6 @@ def _read(told: Mapping[str, object]) -> Findings:
     )
 
 
-def _is_light(white: float, black: float) -> bool:
-    """Tell whether white and black have changed as under another lamp, not as if one showed what the other should."""
-    if max(abs(white), abs(black)) < NO_DRIFT:
-        return True
-    return abs(white - black) < NO_DRIFT * max(abs(white), abs(black))
-
-
 def _is_judged_by_fields(planned: Planned) -> bool:
     if planned.witness is Witness.MARKER:
         return True
@@ -328,7 +314,7 @@ def _drift(found: Findings) -> tuple[Check, ...]:
     failure = NO_DRIFT
     if abs(change) > DRIFT_LIMIT:
         sentence += f", black by {dark:+.1%}" if dark is not None else ""
-        if dark is not None and abs(dark) > abs(change) / 2 and _is_light(change, dark):
+        if dark is not None and abs(dark) > abs(change) / 2 and is_light(change, dark):
             sentence += f": {_ROOM}"
             failure = inf
         elif abs(change) > NO_DRIFT:

@@ -36,6 +36,8 @@ PAIR_LIMIT = 0.25
 """The same for a pattern and its inverse, one of which is shown where the other should be: 70 %. What spills over from
 saturated pixels doesn't add up."""
 MARKER_LIMIT = 0.05
+NO_DRIFT = 0.3
+"""No lamp changes by that much within a stage: the display shows something else."""
 WHITE_LEAST = 0.3
 """White may be so much darker than expected: a camera's tone curve isn't known."""
 
@@ -88,6 +90,8 @@ class Known:
     """The frame taken last and its place in the burst, by camera."""
     levels: dict[tuple[float, str], dict[float, float]] = field(default_factory=dict)
     """Brightness of uniform fields by their code, by exposure and camera; of one burst."""
+    changed: set[str] = field(default_factory=set)
+    """Cameras for which the light isn't what it was when a stage began."""
 
     def take_in(self, camera: str, new: Sequence[Fields]) -> None:
         """Let new fields replace those of their exposure."""
@@ -100,6 +104,7 @@ class Known:
 
     def forget(self, camera: str) -> None:
         """Compare nothing with what a camera saw under another light."""
+        self.changed.add(camera)
         for kept in (self.common, self.levels):
             for key in [key for key in kept if key[1] == camera]:
                 del kept[key]
@@ -146,6 +151,12 @@ class Findings:
         self.marker = max(self.marker, found.marker)
 
 
+def is_light(white: float, black: float) -> bool:
+    """Tell whether white and black have changed as under another lamp, not as if one showed what the other should."""
+    most = max(abs(white), abs(black))
+    return most < NO_DRIFT or abs(white - black) < NO_DRIFT * most
+
+
 class Look:
     """One camera's look at one unit."""
 
@@ -170,8 +181,6 @@ class Look:
         self._of = {p.number: n for n, p in enumerate(self._planned) if p.number is not None}
         self.fields: list[Fields] = []
         """White and black of this unit."""
-        self.change: tuple[float, float] | None = None
-        """How white and black have changed since they were exposed before, where it is more than markers may."""
         self.common: dict[tuple[Any, str], CommonPart] = {}
         self.levels: dict[tuple[float, str], dict[float, float]] = {}
         self.last = self._samples[-1], self._planned[-1].number
@@ -209,8 +218,9 @@ class Look:
     def _compare(self, before: Fields, now: Fields) -> None:
         white = drift(before.white, now.white, before) or 0.0
         black = drift(before.black, now.black, before) or 0.0
-        if max(abs(white), abs(black)) > MARKER_LIMIT:
-            self.change = white, black
+        if max(abs(white), abs(black)) > MARKER_LIMIT and is_light(white, black):
+            # What is compared from now on is what is seen under the light of now.
+            self._known.forget(self._camera)
 
     def _fields(self, exposure: float) -> Fields | None:
         """Return white and black that tell of an exposure: this unit's, or earlier ones."""
@@ -291,7 +301,10 @@ class Look:
         if disorder is not None:
             return disorder
         if one.kind in (SetKind.WHITE, SetKind.BLACK):
-            return self._uniform(one, samples[0])
+            wrong = self._uniform(one, samples[0])
+            return wrong or self._unchanged(
+                one.numbers[0], samples[0], *self._exposed_before(places[0])
+            )
         before = [self._exposed_before(n) for n in places]
         found, limit = self._finding(one, samples, [sample for sample, _ in before])
         if found is None:

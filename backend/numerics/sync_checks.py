@@ -30,6 +30,8 @@ _SURE = 2e-3
 """What chance may add to the square of a share."""
 _HARMONICS = (2, 3)
 """What a bent response adds to a sinusoid; it isn't the display that is late then."""
+_MOST_BENT = 0.6
+"""Of the fundamental: a gamma of 3 makes 0.4. What one lit frame among dark ones makes is 1, and no response does that."""
 _DRIFT_SIGMA = 0.003
 """Standard deviation up to which a drift counts as known."""
 _REPEATED = 0.25
@@ -356,7 +358,8 @@ def movement(first: Fields, white: FrameSample, black: FrameSample | None) -> Mo
     Notes
     -----
     To first order :math:`I' = (1 + g) I + c - s_x \partial_x I - s_y \partial_y I`, by least squares over lit pixels: exact
-    for a fraction of a pixel, and too small for more, which then is in what isn't explained.
+    for a fraction of a pixel, and too small for more, which then is in what isn't explained. The noise of the slopes is
+    taken off the normal equations.
     """
     valid = first.lit & first.white.valid & white.valid
     before, after = first.white.gray, white.gray
@@ -374,10 +377,14 @@ def movement(first: Fields, white: FrameSample, black: FrameSample | None) -> Mo
     normal = design.T @ design
     if np.linalg.matrix_rank(normal) < 4:
         return None
-    solution = np.linalg.solve(normal, design.T @ change)
     left = np.zeros(use.shape, np.float32)
-    left[use] = change - design @ solution
+    left[use] = change - design @ np.linalg.solve(normal, design.T @ change)
     variance = float((left**2).sum(dtype=np.float64)) / count
+    # Noise makes slopes steeper than they are, by half of its variance across and by twice of it down.
+    normal[:2, :2] -= count * variance / 2 * np.diag([0.5, 2.0])
+    if np.linalg.eigvalsh(normal)[0] <= 0:
+        return None
+    solution = np.linalg.solve(normal, design.T @ change)
     error_px = np.sqrt(variance * np.diag(np.linalg.inv(normal))[:2].max())
     if error_px > _SURE_SHIFT_PX:
         return None
@@ -524,6 +531,9 @@ def _bent(
     normal = inside.T @ inside
     regular = normal + 1e-6 * np.trace(normal) * np.eye(len(shapes), dtype=normal.dtype)
     weights = np.linalg.solve(regular, inside.T @ residual[:, valid].ravel())
+    typical = float((modulation[valid] ** 2).mean()) / (scale * float(modulation[valid].mean()))
+    if np.abs(weights[::2] + typical * weights[1::2]).sum() > _MOST_BENT:
+        return np.zeros_like(residual)
     return np.asarray(np.tensordot(weights.astype(np.float32), np.stack(shapes), axes=1))
 
 

@@ -8,7 +8,9 @@ from backend.numerics.sync_checks import (
     FrameSample,
     common_part,
     drift,
+    is_unchanged,
     marker_light,
+    movement,
     pair_part,
     same,
     step_set,
@@ -87,6 +89,70 @@ def test_the_deviation_of_a_late_frame_is_what_the_fit_leaves_of_it() -> None:
     found = step_set(samples(late(steps_seen(4, noise=0.2))), shifts(4))
     assert found is not None
     assert found.share == pytest.approx(0.25, rel=0.25)
+
+
+@pytest.mark.parametrize("steps", [5, 8])
+@pytest.mark.parametrize("lit", [0, 2])
+def test_one_lit_frame_among_dark_ones_is_no_bent_response(steps: int, lit: int) -> None:
+    """It has all harmonics, the same all over the picture: as a response would, but stronger than any."""
+    dull = [seen(np.zeros(SHAPE), seed=k) for k in range(steps)]
+    dull[lit] = seen(fringe(lit, steps), seed=50)
+    found = step_set(samples(dull), shifts(steps))
+    assert found is not None
+    assert found.share > 0.2
+
+
+@pytest.mark.parametrize("steps", [5, 8])
+def test_light_is_told_from_a_pattern(steps: int) -> None:
+    grays = steps_seen(steps)
+    brighter = np.clip(grays[2] + 20 * ALBEDO, 0, 255).astype(np.uint8)
+    found = step_set(samples([*grays[:2], brighter, *grays[3:]]), shifts(steps))
+    assert found is not None
+    assert (found.frame, found.even) == (2, True)
+    shown = step_set(samples(swapped(grays)), shifts(steps))
+    assert shown is not None
+    assert not shown.even
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2, 3.0])
+def test_a_gray_field_that_shows_the_one_before_is_told_whatever_the_gamma(gamma: float) -> None:
+    fields = fields_of()
+    codes = [48.0, 64.0, 96.0, 160.0, 224.0]
+    grays = samples([seen(np.full(SHAPE, (c / 255) ** gamma), seed=int(c)) for c in codes])
+    again = samples([seen(np.full(SHAPE, (c / 255) ** gamma), seed=7) for c in codes])
+    for n in range(1, len(codes)):
+        pair = (codes[n], codes[n - 1])
+        assert not is_unchanged(grays[n], grays[n - 1], pair, fields, 1.0)
+        assert is_unchanged(again[n - 1], grays[n - 1], pair, fields, 1.0)
+    assert not is_unchanged(again[0], grays[0], (0.0, 255.0), fields, 1.0), "cut off, some displays"
+
+
+@pytest.mark.parametrize(("x_px", "y_px"), [(0.0, 0.0), (0.5, 0.0), (0.0, -0.4), (0.3, 0.2)])
+@pytest.mark.parametrize("brighter", [0.0, 0.1])
+def test_a_movement_is_found_whatever_the_light_does(
+    x_px: float, y_px: float, brighter: float
+) -> None:
+    def scene(dx: float, dy: float) -> np.ndarray:
+        x, y = X - dx, Y - dy
+        return np.asarray(0.6 + 0.2 * np.sin(x / 5) + 0.2 * np.cos(y / 6 + x / 17))
+
+    def exposed(light: float, dx: float, dy: float, room: float, seed: int) -> FrameSample:
+        rng = np.random.default_rng(seed)
+        gray = 8 + scene(dx, dy) * 150 * light + room * (5 + X / 20) + rng.normal(0, 1, SHAPE)
+        return samples([np.clip(np.rint(gray), 0, 255).astype(np.uint8)])[0]
+
+    first = Fields(exposed(1.0, 0, 0, 0, 1), exposed(0.0, 0, 0, 0, 2), 1.0)
+    room = 10 * brighter
+    white = exposed(1.0 - brighter, x_px, y_px, room, 3)
+    moved = movement(first, white, exposed(0.0, x_px, y_px, room, 4))
+    assert moved is not None
+    assert (moved.x_px, moved.y_px) == pytest.approx((x_px, y_px), abs=0.06)
+    assert moved.share < 0.02
+
+
+def test_an_even_scene_doesnt_tell_of_movement() -> None:
+    white, black = samples([np.full(SHAPE, g, np.uint8) for g in (150, 8)])
+    assert movement(Fields(white, black, 1.0), white, None) is None
 
 
 @pytest.mark.parametrize("gray", [0, 255])
