@@ -10,6 +10,7 @@ from backend.domain.errors import NotFoundError
 from backend.numerics.live_numbers import live_numbers, mark_extremes
 from backend.services.context import Context
 from backend.services.previews import draw, encoded
+from backend.services.rigs import refuse_unknown
 
 Array = np.ndarray[tuple[int, ...], np.dtype[Any]]
 
@@ -65,6 +66,7 @@ def live_frame(
     """
     picture = context.rigs.live(rig, camera)
     if picture is None:
+        refuse_unknown(context, rig)
         return None
     key = ("live", rig, camera, picture.number, max_px, marks, crop)
     return context.previews.get(
@@ -76,6 +78,7 @@ def live_part(context: Context, rig: str, camera: str, crop: Crop) -> PartView |
     """Tell what a part of the newest picture of a camera says, None if there is none; never waits for a device."""
     picture = context.rigs.live(rig, camera)
     if picture is None:
+        refuse_unknown(context, rig)
         return None
     facts = context.rigs.status(rig).facts
     known = facts.cameras.get(camera) if facts else None

@@ -257,6 +257,7 @@ class RigDesk:
 
     def cancel(self, rig: str, who: str) -> RigState:
         """Have the running work ended; ConflictError if nothing runs."""
+        self._offer(rig)
         self._works.cancel(rig, who)
         return self.state(rig)
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from backend.devices.errors import DeviceDisconnected, IncompleteFrame
+from backend.devices.errors import DeviceDisconnected, DeviceError, IncompleteFrame
 from backend.devices.pages import PageDesk
 from backend.devices.rig_shelf import RigShelf
 from backend.jobs.rigs import Owner
@@ -61,11 +61,12 @@ class Bench:
 def until(condition: Callable[[], bool]) -> None:
     """Wait for what happens on the rig's thread."""
     pause = threading.Event()
-    for _ in range(500):
+    deadline_s = time.monotonic() + 60.0
+    while time.monotonic() < deadline_s:
         if condition():
             return
         pause.wait(0.02)
-    raise AssertionError("it didn't happen within 10 s")
+    raise AssertionError("it didn't happen within 60 s")
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +144,9 @@ def test_a_few_live_pictures_with_parts_missing_are_nobodys_business(
     bench: Bench, lost: int, told: bool
 ) -> None:
     bench.connect().set_live(exposure_ms=10)
-    errors = [IncompleteFrame("left", "packets are missing; take it again") for _ in range(lost)]
+    errors: list[DeviceError] = [
+        IncompleteFrame("left", "packets are missing; take it again") for _ in range(lost)
+    ]
     bench.house.rigs.faults.errors = {0: errors}
     failures = set()
 
@@ -161,7 +164,13 @@ def test_a_rig_that_nobody_knows_is_refused_by_name(bench: Bench) -> None:
     for answer in (
         bench.viewer.get("/api/rigs/nobody/state"),
         bench.viewer.get("/api/rigs/nobody/live"),
+        bench.viewer.get("/api/rigs/nobody/cameras/left/preview"),
         bench.operator.post("/api/rigs/nobody/check"),
+        bench.operator.post("/api/rigs/nobody/connect", json={}),
+        bench.operator.post("/api/rigs/nobody/view", json={}),
+        bench.operator.put("/api/rigs/nobody/live", json={}),
+        bench.operator.post("/api/rigs/nobody/latency", json={}),
+        bench.operator.delete("/api/rigs/nobody/work"),
     ):
         assert answer.status_code == 404
         assert "no rig 'nobody'" in answer.json()["detail"]
@@ -350,7 +359,9 @@ def test_a_camera_that_hangs_costs_no_answer(bench: Bench) -> None:
         took_s.append(time.perf_counter() - began_s)
 
     assert not hold.is_set(), "the camera hangs still"
-    assert sorted(took_s)[len(took_s) // 2] < 0.1
+    assert (
+        sorted(took_s)[len(took_s) // 2] < 2.0
+    )  # 10 ms where nothing else runs; whoever waits, waits for 10 s
     until(lambda: bench.state()["link"] == "closed")
 
 

@@ -167,7 +167,8 @@ def test_the_live_picture_is_the_newest_frame(house: House, state: ScanState) ->
     assert picture is not None
     assert size_of(picture) == (16, 24, 3)
     assert house.services.live_frame("toy", "top") is None
-    assert house.services.live_frame("nowhere", "left") is None
+    with pytest.raises(NotFoundError, match="no rig 'nowhere'"):
+        house.services.live_frame("nowhere", "left")
 
 
 # how long it takes
