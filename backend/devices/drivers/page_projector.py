@@ -104,9 +104,8 @@ class PageProjector(Link):
     def state(self) -> LinkState:
         """Where it is in its life: lost as soon as its page is gone."""
         page = self._page
-        if self._state is LinkState.READY and page is not None and page.gone:
-            self._state = LinkState.LOST
-        return self._state
+        is_gone = self._state is LinkState.READY and page is not None and page.gone
+        return LinkState.LOST if is_gone else self._state  # whoever asks for a pattern is told why
 
     @property
     def remarks(self) -> tuple[str, ...]:
