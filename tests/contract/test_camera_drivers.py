@@ -508,7 +508,7 @@ def test_a_device_that_is_stuck_is_a_timeout_and_can_be_left():
         with pytest.raises(DeviceTimeout, match=r"left: no frame came within 0.2 s; take it again"):
             camera.get_frame(timeout_s=0.2)
         camera.close()
-        assert time.monotonic() - started_s < 5.0
+        assert time.monotonic() - started_s < 15.0, "it is stuck for 20 s"
         device.stuck.set()
 
 

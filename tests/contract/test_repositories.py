@@ -291,7 +291,7 @@ def test_a_locked_scan_keeps_other_writers_out(database: Database, scan: str) ->
     locked = threading.Event()
 
     def wait_for_the_lock() -> None:
-        locked.wait(10)
+        locked.wait(60)
         with database.transaction() as r:
             r.scans.lock(scan)
             order.append("second")

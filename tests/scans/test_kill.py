@@ -1,5 +1,6 @@
 """Kill -9 at any moment: what was finished or captured counts, nothing is half-written, the scan goes on."""
 
+import itertools
 import multiprocessing
 import random
 import time
@@ -52,32 +53,37 @@ def look(house: House, scan: str) -> tuple[int, int]:
 
 
 def test_a_scan_survives_being_killed_at_any_moment(house: House, tmp_path: Path) -> None:
-    for _ in range(
-        2
-    ):  # the first one waits for the imports of the process that the others are forked from
+    for _ in range(2):  # the first one waits for the imports of what the others are forked from
         reference = house.create(settings=SETTINGS).id
-        began = time.monotonic()
+        began_s = time.monotonic()
         whole = start(killed.carry_on, house, reference, tmp_path)
         whole.join()
-        took_s = time.monotonic() - began
+        took_s = time.monotonic() - began_s
         assert whole.exitcode == 0
     wanted = hashes(house.services.scan(reference))
     assert set(statuses(house.services.scan(reference)).values()) == {"done"}
 
     moments = random.Random(5)
     scan, before, in_the_middle = "", (0, 0), 0
-    for _ in range(KILLS):
+    for kills in itertools.count(1):
         if not scan or set(statuses(house.services.scan(scan)).values()) == {"done"}:
             scan, before = house.create(settings=SETTINGS).id, (0, 0)
+        began_s = time.monotonic()
         process = start(killed.carry_on, house, scan, tmp_path)
         process.join(moments.uniform(0.0, took_s))
         process.kill()
         process.join()
+        if (
+            process.exitcode == 0
+        ):  # the machine is quicker than it was: the next moments come sooner
+            took_s = min(took_s, time.monotonic() - began_s)
         in_the_middle += process.exitcode != 0
         after = look(house, scan)
         assert after >= before, "what counted before still counts"
         before = after
-    assert in_the_middle >= KILLS // 2, "most kills have to hit a running scan"
+        if kills >= KILLS and in_the_middle >= KILLS // 2:
+            break
+        assert kills < 5 * KILLS, "most kills have to hit a running scan"
 
     last = start(killed.carry_on, house, scan, tmp_path)
     last.join()

@@ -19,6 +19,7 @@ from backend.devices.sim.rig import SimulatedRig
 from tests.loopback import loopback_address
 from tests.ui.test_projector_page import patterns
 from tests.ui.two_monitors import (
+    PATIENCE_S,
     SIZE,
     Desktop,
     Program,
@@ -105,8 +106,9 @@ def opened_window(desktop: Desktop, station: Station, playwright: Playwright) ->
         browser = playwright.chromium.connect_over_cdp(tools)
         closing_all.callback(browser.close)
         page = next(p for p in browser.contexts[0].pages if "/projector" in p.url)
+        page.set_default_timeout(1000 * PATIENCE_S)
         # A scan that waits for the page shows its pattern at once, and so hides this text.
-        page.get_by_text("waiting for patterns").wait_for(state="attached")
+        page.get_by_text("waits for patterns").wait_for(state="attached")
         page.wait_for_function(
             "([left, width, height]) => screenX === left && innerWidth === width && innerHeight === height",
             arg=[SIZE[0], *SIZE],
@@ -158,10 +160,16 @@ def test_an_unattended_scan_with_real_protocols_is_as_good_as_its_noise(
     assert points["value"] > 30_000
 
 
-def test_injected_lag_is_found_and_the_scan_is_as_good(
+def test_injected_lag_is_refused_without_settling_and_found_and_then_the_scan_is_as_good(
     desktop: Desktop, window: Window, station: Station
 ) -> None:
     with simulated(desktop, station, "late", "--lag-ms=60"):
+        file = desktop.folder / "late.yaml"
+        file.write_text(file.read_text().replace("  gamma:", "  settle_ms: 0.0\n  gamma:"))
+        station.add_rig(file, "hurried")
+        error = station.scan("hurried", **BRIEF).start().end()["error"]
+        assert error is not None
+        assert "settle" in error or "pattern" in error
         station.give_page_to("late")
         station.post("/api/rigs/late/latency", repetitions=10)
         wait_for(lambda: station.get("/api/rigs/late/latency"), "the latency calibration")
@@ -170,18 +178,6 @@ def test_injected_lag_is_found_and_the_scan_is_as_good(
         # The lag, up to half a frame of the steps that are tried, and the frame that is added for safety.
         assert 60.0 <= found["settle_ms"] <= 90.0
         assert has_good_columns(station.scan("late", exposures={"steps": 8}).start())
-
-
-def test_without_settling_the_checks_refuse_a_lagging_projector(
-    desktop: Desktop, window: Window, station: Station
-) -> None:
-    with simulated(desktop, station, "hasty", "--lag-ms=60"):
-        file = desktop.folder / "hasty.yaml"
-        file.write_text(file.read_text().replace("  gamma:", "  settle_ms: 0.0\n  gamma:"))
-        station.add_rig(file, "hurried")
-        error = station.scan("hurried", **BRIEF).start().end()["error"]
-        assert error is not None
-        assert "settle" in error or "pattern" in error
 
 
 def shows(screen: Screen, pattern: "np.ndarray[Any, Any]") -> bool:

@@ -20,7 +20,7 @@ class SlowHid:
     def read(self, max_length: int, timeout_ms: int = 0) -> bytes:
         del max_length, timeout_ms
         self.asked.set()
-        self.answers.wait(5)
+        self.answers.wait(60)
         self.closed_while_asked = self.closed.is_set()
         return next(protocol.Reply(1).reports())
 
@@ -35,7 +35,7 @@ def test_a_connection_is_not_closed_under_a_command():
     asking = threading.Thread(target=commands.write, args=(Command.POWER, b"\0"))
     hanging_up = threading.Thread(target=commands.close)
     asking.start()
-    assert hid.asked.wait(5)
+    assert hid.asked.wait(60)
     hanging_up.start()
     assert not hid.closed.wait(0.05)
     hid.answers.set()
