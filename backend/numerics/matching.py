@@ -8,12 +8,11 @@ from jaxtyping import Float32, UInt16
 from backend.numerics.errors import MatchingError
 from backend.numerics.kernels import kernel_input
 from backend.numerics.lattice import Lattice
+from backend.numerics.matching_index import SPARE_CELLS, index_rows
 from backend.numerics.matching_kernels import (
     CHECKED_ROWS,
-    SPARE_CELLS,
     Index,
     Limits,
-    index_rows,
     match_rows,
     sample_rows,
 )

@@ -7,23 +7,20 @@ import numpy as np
 
 from backend.numerics.kernels import kernel, row_loop
 from backend.numerics.lattice import lattice_row
+from backend.numerics.matching_index import SAME_PLACE_PX, SPARE_CELLS
 from backend.numerics.reasons import Reason
 
 _EMPTY = np.float32(np.nan)
 _ONE = np.uint64(1)
 # Numbers in a kernel have to be float32 one by one: a Python float makes the whole loop float64.
 _ZERO, _HALF, _ONE_PX, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
-_MANY = np.float32(np.inf)
 _NO_MATCH = np.uint16(Reason.NO_MATCH)
 _AMBIGUOUS = np.uint16(Reason.AMBIGUOUS_MATCH)
 _ONE_WAY = np.uint16(Reason.LEFT_RIGHT_CHECK)
-_SAME_PLACE_PX = 3.0
-"""Crossings of one coordinate this near to each other are noise on one surface, not two surfaces."""
-_NEAR = np.float32(_SAME_PLACE_PX)
-CHECKED_ROWS = 2
+_NEAR = np.float32(SAME_PLACE_PX)
+_CHECKED_SHIFT = np.int32(1)
+CHECKED_ROWS = 1 << int(_CHECKED_SHIFT)
 """The check both ways looks at every n-th row of the reference: it asks for a place within pixels."""
-SPARE_CELLS = 16
-"""Cells at the end of an index row for what isn't wanted."""
 _TILE = 512
 """Pixels whose intermediate rows stay in the first-level cache."""
 _FLATTEST = np.float32(50.0)
@@ -51,94 +48,6 @@ class Limits(NamedTuple):
 
 
 @row_loop
-def _nearest(values: Any, px: Any, py: Any, out: Any) -> Any:
-    """Pick the pixel nearest to each position; NaN outside."""
-    height, width = values.shape
-    right, bottom = np.float32(width), np.float32(height)
-    for i in range(out.size):
-        x, y = np.floor(px[i] + _HALF), np.floor(py[i] + _HALF)
-        inside = (x >= _ZERO) & (x < right) & (y >= _ZERO) & (y < bottom)
-        # unsigned, or each access would test for an index that counts from the end
-        column = np.uint64(np.int32(x)) if inside else np.uint64(0)
-        row = np.uint64(np.int32(y)) if inside else np.uint64(0)
-        value = values[row, column]
-        out[i] = value if inside else _EMPTY
-
-
-@row_loop
-def _true_places(px: Any, py: Any, x0: Any, across: Any, down: Any, place: Any) -> Any:
-    """Say where on the canvas the pixels lie that `_nearest` picks."""
-    for i in range(place.size):
-        off_x = np.floor(px[i] + _HALF) - px[i]
-        off_y = np.floor(py[i] + _HALF) - py[i]
-        place[i] = x0 + np.float32(i) + across * off_x + down * off_y
-
-
-@row_loop
-def _note(k: Any, place: Any, out: Any) -> Any:
-    """Write one crossing into its cell; two far apart make it infinite."""
-    old = out[k]
-    same = old if abs(old - place) <= _NEAR else _MANY
-    out[k] = place if np.isnan(old) else same
-
-
-@row_loop
-def _crossings(row: Any, place: Any, low: Any, per_step: Any, jump_cells: Any, out: Any) -> Any:
-    """Write where the row crosses each value low + k step; inf where it does so at two places."""
-    size = out.size - SPARE_CELLS
-    end = np.float32(size)
-    for cell in range(out.size):
-        out[cell] = _EMPTY
-    before = (row[0] - low) * per_step
-    for i in range(1, row.size):
-        now = (row[i] - low) * per_step
-        difference = now - before
-        if abs(difference) <= jump_cells:  # False with NaN
-            highest, lowest = max(before, now), min(before, now)
-            top = np.floor(highest)
-            per_cell = (place[i] - place[i - 1]) / difference
-            # Mostly none, one or two: written without asking, what isn't crossed into the spare cell. Whether
-            # a value is crossed can't be foreseen, so each question would cost more than the answer. The spare
-            # cells take turns: writing to one that was just written to means waiting for it.
-            spare = np.uint64(size + 2 * (i % (SPARE_CELLS // 2)))
-            for step in range(2):
-                level = top - np.float32(step)
-                crossed = (level >= lowest) & (level >= _ZERO) & (level < end) & (highest > lowest)
-                k = np.uint64(np.int32(level)) if crossed else spare + np.uint64(step)
-                _note(k, place[i - 1] + (level - before) * per_cell, out)
-            if difference > _TWO or difference < -_TWO:
-                level = top - _TWO
-                while level >= lowest:
-                    if _ZERO <= level < end:
-                        _note(
-                            np.uint64(np.int32(level)),
-                            place[i - 1] + (level - before) * per_cell,
-                            out,
-                        )
-                    level -= _ONE_PX
-        before = now
-
-
-@kernel
-def index_rows(values: Any, nodes: Any, width: Any, every: Any, numbers: Any, index: Any) -> None:
-    """Note where every n-th row of a canvas crosses the grid's values; `numbers` are x0, low, per_step, jump in steps."""
-    for number in numba.prange(index.shape[0]):
-        y = np.int64(number) * every
-        rows = np.empty((4, width), np.float32)
-        px, py, row, place = rows[0], rows[1], rows[2], rows[3]
-        work = np.empty(nodes.shape[2], np.float64)
-        lattice_row(nodes[0], y, work, px)
-        lattice_row(nodes[1], y, work, py)
-        _nearest(values, px, py, row)
-        # the canvas' direction in the picture, hardly changing along a row
-        across = (px[width - 1] - px[0]) / np.float32(width - 1)
-        down = (py[width - 1] - py[0]) / np.float32(width - 1)
-        square = across * across + down * down
-        _true_places(px, py, numbers[0], across / square, down / square, place)
-        _crossings(row, place, numbers[1], numbers[2], numbers[3], index[number])
-
-
-@row_loop
 def _two_entries(a: Any, b: Any, part: Any) -> Any:
     """Return the place between two index entries, and a second one if they are far apart."""
     if np.isnan(a):
@@ -162,54 +71,123 @@ def _mutual(a: Any, b: Any, part: Any, x: Any, agreement: Any) -> Any:
     return abs(first - x) <= agreement or abs(second - x) <= agreement
 
 
+# Start and first step are taken for a tile of pixels at a time: plain loops over few rows, and what is looked up
+# apart from what is calculated, so that the latter become vector instructions.
+
+
 @row_loop
-def _start_row(
-    targets: Any, x: Any, line: Any, index: Any, limits: Any, start: Any, second: Any, reasons: Any
+def _pairs(plane: Any, at: Any, first: Any, second: Any) -> Any:
+    """Fetch two neighbours each."""
+    for n in range(first.size):
+        k = np.uint64(at[n])
+        first[n], second[n] = plane[k], plane[k + _ONE]
+
+
+@row_loop
+def _singles(plane: Any, at: Any, out: Any) -> Any:
+    for n in range(out.size):
+        out[n] = plane[np.uint64(at[n])]
+
+
+@row_loop
+def _cells_of(
+    targets: Any, line: Any, index: Any, limits: Any, part: Any, other: Any, reference: Any
 ) -> Any:
-    """Look up where to start on each pixel's epipolar line; say whether a pixel has two places."""
-    rows, cells = (
-        np.float32(index.other.shape[0]),
-        np.float32(index.other.shape[1] - SPARE_CELLS - 1),
-    )
+    """Return the numbers of the index entries below each coordinate, and its place above; NaN outside of the index."""
+    columns = np.int32(index.other.shape[1])
+    rows, cells = np.float32(index.other.shape[0]), np.float32(columns - SPARE_CELLS - 1)
+    for n in range(targets.size):
+        nearest = line[n] + _HALF
+        cell = (targets[n] - limits.low) * limits.per_step
+        inside = (nearest >= _ZERO) & (nearest < rows) & (cell >= _ZERO) & (cell < cells)
+        row = np.int32(nearest) if inside else np.int32(0)
+        k = np.int32(cell) if inside else np.int32(0)
+        part[n] = cell - np.float32(k) if inside else _EMPTY
+        other[n] = row * columns + k
+        reference[n] = (row >> _CHECKED_SHIFT) * columns + k
+
+
+@row_loop
+def _clear_starts(
+    targets: Any,
+    x: Any,
+    part: Any,
+    a: Any,
+    b: Any,
+    c: Any,
+    d: Any,
+    limits: Any,
+    start: Any,
+    reasons: Any,
+) -> Any:
+    """Start between two entries that agree and lead back; count pixels that need a closer look."""
+    doubts = np.int32(0)
+    for n in range(targets.size):
+        back = c[n] + part[n] * (d[n] - c[n])
+        clear = (abs(a[n] - b[n]) <= _TWO * _NEAR) & (abs(c[n] - d[n]) <= _TWO * _NEAR)
+        clear &= abs(back - x[n]) <= limits.agreement  # nearly always; False with NaN and inf
+        start[n] = a[n] + part[n] * (b[n] - a[n]) - limits.x0 if clear else _EMPTY
+        within = part[n] == part[n]
+        reasons[n] = _NO_MATCH if (targets[n] == targets[n]) & (not within) else np.uint16(0)
+        doubts += np.int32(within & (not clear))
+    return doubts
+
+
+@row_loop
+def _doubtful_starts(
+    x: Any,
+    part: Any,
+    a: Any,
+    b: Any,
+    c: Any,
+    d: Any,
+    limits: Any,
+    start: Any,
+    second: Any,
+    reasons: Any,
+) -> Any:
+    """Start where entries are missing or far apart; say whether a pixel has two places."""
     two_places = False
-    for i in range(targets.size):
-        start[i] = second[i] = _EMPTY
-        reasons[i] = 0
-        if np.isnan(targets[i]):
+    for n in range(start.size):
+        if np.isnan(part[n]) or not np.isnan(start[n]):
             continue
-        nearest = line[i] + _HALF
-        cell = (targets[i] - limits.low) * limits.per_step
-        if not ((nearest >= _ZERO) & (nearest < rows) & (cell >= _ZERO) & (cell < cells)):
-            reasons[i] = _NO_MATCH
-            continue
-        row, k = np.uint64(np.int32(nearest)), np.uint64(np.int32(cell))
-        part = cell - np.float32(np.int32(cell))
-        a, b = index.other[row, k], index.other[row, k + _ONE]
-        row //= np.uint64(CHECKED_ROWS)
-        c, d = index.reference[row, k], index.reference[row, k + _ONE]
-        back = c + part * (d - c)
-        if (
-            (abs(a - b) <= _TWO * _NEAR)
-            & (abs(c - d) <= _TWO * _NEAR)
-            & (abs(back - x[i]) <= limits.agreement)
-        ):  # nearly always; False with NaN and inf
-            start[i] = a + part * (b - a) - limits.x0
-            continue
-        first, other = _two_entries(a, b, part)
+        first, other = _two_entries(a[n], b[n], part[n])
         if np.isnan(first):
-            reasons[i] = _NO_MATCH
+            reasons[n] = _NO_MATCH
         elif np.isinf(first) or np.isinf(other):
-            reasons[i] = _AMBIGUOUS
-        elif not _mutual(c, d, part, x[i], limits.agreement):
-            reasons[i] = _ONE_WAY
+            reasons[n] = _AMBIGUOUS
+        elif not _mutual(c[n], d[n], part[n], x[n], limits.agreement):
+            reasons[n] = _ONE_WAY
         else:
-            start[i], second[i] = first - limits.x0, other - limits.x0
+            start[n], second[n] = first - limits.x0, other - limits.x0
             two_places |= not np.isnan(other)
     return two_places
 
 
-# The first step, a tile of pixels at a time: plain loops over few rows, and what is looked up apart from what is
-# calculated, so that the latter become vector instructions.
+@row_loop
+def _start(
+    targets: Any,
+    x: Any,
+    line: Any,
+    index: Any,
+    limits: Any,
+    rows: Any,
+    start: Any,
+    second: Any,
+    reasons: Any,
+) -> Any:
+    """Look up where to start on each pixel's epipolar line; say whether a pixel has two places."""
+    size = targets.size
+    part, a, b = rows.single[0, :size], rows.single[1, :size], rows.single[2, :size]
+    c, d = rows.single[3, :size], rows.single[4, :size]
+    other, reference = rows.corner[0, :size], rows.corner[1, :size]
+    _cells_of(targets, line, index, limits, part, other, reference)
+    _pairs(index.other.reshape(-1), other, a, b)
+    _pairs(index.reference.reshape(-1), reference, c, d)
+    second[:] = _EMPTY
+    if _clear_starts(targets, x, part, a, b, c, d, limits, start, reasons) == 0:
+        return False
+    return _doubtful_starts(x, part, a, b, c, d, limits, start, second, reasons)
 
 
 @row_loop
@@ -231,21 +209,20 @@ def _corner_of(x: Any, y: Any, width: Any, height: Any, corner: Any, right: Any,
 
 @row_loop
 def _follow(
-    plane: Any, next_row: Any, corner: Any, right: Any, below: Any, out: Any, change: Any
+    value: Any, right_of: Any, below_of: Any, right: Any, below: Any, out: Any, change: Any
 ) -> Any:
     """Interpolate a smooth plane, and give its change along the row."""
-    for n in range(corner.size):
-        k = np.uint64(corner[n])
-        value = plane[k]
-        change[n] = plane[k + _ONE] - value
-        out[n] = value + right[n] * change[n] + below[n] * (next_row[k] - value)
+    for n in range(out.size):
+        change[n] = right_of[n] - value[n]
+        out[n] = value[n] + right[n] * change[n] + below[n] * (below_of[n] - value[n])
 
 
 @row_loop
 def _evaluate(
-    values: Any,
-    next_row: Any,
-    corner: Any,
+    u00: Any,
+    u01: Any,
+    u10: Any,
+    u11: Any,
     a: Any,
     b: Any,
     dx: Any,
@@ -255,14 +232,13 @@ def _evaluate(
     spread: Any,
 ) -> Any:
     """Interpolate between four pixels: value, slope along the epipolar line, range of the four."""
-    for n in range(corner.size):
-        k = np.uint64(corner[n])
-        u00, u01, u10, u11 = values[k], values[k + _ONE], next_row[k], next_row[k + _ONE]
-        top, bottom, left = u01 - u00, u11 - u10, u10 - u00
+    for n in range(value.size):
+        top, bottom, left = u01[n] - u00[n], u11[n] - u10[n], u10[n] - u00[n]
         twist = bottom - top
         slope[n] = (top + b[n] * twist) * dx[n] + (left + a[n] * twist) * dy[n]
-        value[n] = u00 + a[n] * top + b[n] * (left + a[n] * twist)
-        spread[n] = max(max(u00, u01), max(u10, u11)) - min(min(u00, u01), min(u10, u11))
+        value[n] = u00[n] + a[n] * top + b[n] * (left + a[n] * twist)
+        highest = max(max(u00[n], u01[n]), max(u10[n], u11[n]))
+        spread[n] = highest - min(min(u00[n], u01[n]), min(u10[n], u11[n]))
 
 
 @row_loop
@@ -323,27 +299,22 @@ def _first_step(
     size = targets.size
     rows_px, columns = pixel_of_canvas.shape[1], pixel_of_canvas.shape[2]
     height, width = values.shape
-    corner, flat = rows.corner[:size], values.reshape(-1)
-    right, below, dx, dy = (
-        rows.single[0, :size],
-        rows.single[1, :size],
-        rows.single[2, :size],
-        rows.single[3, :size],
-    )
-    px, py, move, weight = (
-        rows.single[4, :size],
-        rows.single[5, :size],
-        rows.single[6, :size],
-        rows.single[7, :size],
-    )
+    single = rows.single
+    corner, flat = rows.corner[0, :size], values.reshape(-1)
+    right, below, dx, dy = single[0, :size], single[1, :size], single[2, :size], single[3, :size]
+    px, py, move, weight = single[4, :size], single[5, :size], single[6, :size], single[7, :size]
+    u00, u01, u10, u11 = single[8, :size], single[9, :size], single[10, :size], single[11, :size]
     _corner_of(start, line, columns, rows_px, corner, right, below)
-    plane = pixel_of_canvas[0].reshape(-1)
-    _follow(plane, plane[columns:], corner, right, below, px, dx)
-    plane = pixel_of_canvas[1].reshape(-1)
-    _follow(plane, plane[columns:], corner, right, below, py, dy)
+    for plane, place, change in ((0, px, dx), (1, py, dy)):
+        smooth = pixel_of_canvas[plane].reshape(-1)
+        _pairs(smooth, corner, u00, u01)
+        _singles(smooth[columns:], corner, u10)
+        _follow(u00, u01, u10, right, below, place, change)
     _corner_of(px, py, width, height, corner, right, below)
+    _pairs(flat, corner, u00, u01)
+    _pairs(flat[width:], corner, u10, u11)
     # value and spread take the places that aren't used any more
-    _evaluate(flat, flat[width:], corner, right, below, dx, dy, px, slope, py)
+    _evaluate(u00, u01, u10, u11, right, below, dx, dy, px, slope, py)
     _step(targets, px, slope, py, jump, right, below, move)
     _land(start, move, right, below, dx, dy, x, again, weight)
     if sigma.shape[0] == height:
@@ -383,7 +354,7 @@ def _refine_row(  # noqa: C901  # one loop: splitting it costs a call with 40 ar
         fy = line[n] - np.float64(row)
         for attempt in range(10):
             floor_x = np.floor(x)
-            if floor_x < 0 or floor_x >= columns - 1 or abs(x - last) > _SAME_PLACE_PX:
+            if floor_x < 0 or floor_x >= columns - 1 or abs(x - last) > SAME_PLACE_PX:
                 break
             fx = x - floor_x
             column = np.uint64(np.int64(floor_x))
@@ -445,7 +416,7 @@ def _choose_row(
             continue
         if np.isnan(x[i]):
             x[i], slope[i], variance[i] = x2[i], slope2[i], variance2[i]
-        elif abs(x[i] - x2[i]) > _SAME_PLACE_PX:
+        elif abs(x[i] - x2[i]) > SAME_PLACE_PX:
             x[i] = slope[i] = variance[i] = np.nan
             reasons[i] = _AMBIGUOUS
 
@@ -470,8 +441,8 @@ def _explain_row(targets: Any, x: Any, reasons: Any) -> Any:
 class _Rows(NamedTuple):
     """Intermediate values of one tile."""
 
-    single: Any  # float32[8, tile]
-    corner: Any  # int32[tile]
+    single: Any  # float32[12, tile]
+    corner: Any  # int32[2, tile]
 
 
 @row_loop
@@ -492,9 +463,20 @@ def _match_row(
     width = reference_row.size
     found, slope, variance, start, second = rows[0], rows[1], rows[2], rows[3], rows[4]
     again = rows[5]
-    two_places = _start_row(reference_row, x, line, index, limits, start, second, reasons)
+    two_places = False
     for begin in range(0, width, _TILE):
         end = min(begin + _TILE, width)
+        two_places |= _start(
+            reference_row[begin:end],
+            x[begin:end],
+            line[begin:end],
+            index,
+            limits,
+            tile,
+            start[begin:end],
+            second[begin:end],
+            reasons[begin:end],
+        )
         _first_step(
             other_px,
             sigma_other,
@@ -559,7 +541,7 @@ def match_rows(
     known = np.int64(1 if sigma_reference.shape[0] == height else 0)
     for row in numba.prange(height):
         rows = np.empty((11, width), np.float32)
-        tile = _Rows(np.empty((8, _TILE), np.float32), np.empty(_TILE, np.int32))
+        tile = _Rows(np.empty((12, _TILE), np.float32), np.empty((2, _TILE), np.int32))
         work = np.empty(nodes.shape[2], np.float64)
         x, line = rows[9], rows[10]
         lattice_row(nodes[0], row, work, x)
