@@ -30,8 +30,9 @@ _SURE = 2e-3
 """What chance may add to the square of a share."""
 _HARMONICS = (2, 3)
 """What a bent response adds to a sinusoid; it isn't the display that is late then."""
-_MOST_BENT = 0.6
-"""Of the fundamental: a gamma of 3 makes 0.4. What one lit frame among dark ones makes is 1, and no response does that."""
+_MOST_BENT = 0.8
+"""Of the fundamental: a gamma of 3 makes 0.5. What one lit frame among dark ones makes is 1 or more, and no response does
+that. Of four steps it makes 0.5, and clipped light more: there it doesn't tell."""
 _DRIFT_SIGMA = 0.003
 """Standard deviation up to which a drift counts as known."""
 _REPEATED = 0.25
@@ -42,6 +43,8 @@ _GRAYS_LIKELY = (48.0, 232.0)
 """Between these codes every display is brighter for a higher code; some cut off what is beyond."""
 _LEAST_STEP = 0.05
 """Share of a linear display's step that is left of it between those codes where its gamma is 3."""
+_LEAST_MOVED = 0.06
+"""Light, as a share of full scale, below which whole gray levels are too coarse to tell a movement."""
 _SURE_SHIFT_PX = 0.1
 """Standard error up to which a movement counts as known."""
 
@@ -389,6 +392,8 @@ def movement(first: Fields, white: FrameSample, black: FrameSample | None) -> Mo
     if error_px > _SURE_SHIFT_PX:
         return None
     light = float((first.white.gray - first.black.gray)[..., 1:-1][use].mean())
+    if light < _LEAST_MOVED * white.full_scale_gray:
+        return None
     unexplained = max(float((left[..., 1:] * left[..., :-1]).sum(dtype=np.float64)), 0.0) / count
     return Movement(float(solution[0]), float(solution[1]), float(np.sqrt(unexplained)) / light)
 
@@ -532,7 +537,8 @@ def _bent(
     regular = normal + 1e-6 * np.trace(normal) * np.eye(len(shapes), dtype=normal.dtype)
     weights = np.linalg.solve(regular, inside.T @ residual[:, valid].ravel())
     typical = float((modulation[valid] ** 2).mean()) / (scale * float(modulation[valid].mean()))
-    if np.abs(weights[::2] + typical * weights[1::2]).sum() > _MOST_BENT:
+    bent = float(np.abs(weights[::2] + typical * weights[1::2]).sum())
+    if len(shifts_rad) > 4 and bent > _MOST_BENT:
         return np.zeros_like(residual)
     return np.asarray(np.tensordot(weights.astype(np.float32), np.stack(shapes), axes=1))
 

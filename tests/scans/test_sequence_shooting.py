@@ -235,11 +235,11 @@ def test_a_gap_that_stays_ends_in_one_sentence_that_names_the_frame(
 
 
 def test_sequences_are_verified_where_light_isnt_certain(store: LocalArtifactStore) -> None:
-    """Witnesses, marker and step set, all by the projector's clock."""
+    """White and black, marker and step sets, and at the end white again; black, too, where white is saturated."""
     with WiredRig(certain=False) as rig:
         _, journal = captured(rig, store, *fringes(4), *fringes(4, 20.0))
         assert len(journal) == 16
-        assert sum(run[0] for run in rig.projector.runs) == 8 + 2 + 1 + 1
+        assert sum(run[0] for run in rig.projector.runs) == 8 + 2 + 1 + 2
         assert rig.projector.shows == 0
 
 
