@@ -383,8 +383,10 @@ def movement(first: Fields, white: FrameSample, black: FrameSample | None) -> Mo
     left = np.zeros(use.shape, np.float32)
     left[use] = change - design @ np.linalg.solve(normal, design.T @ change)
     variance = float((left**2).sum(dtype=np.float64)) / count
-    # Noise makes slopes steeper than they are, by half of its variance across and by twice of it down.
-    normal[:2, :2] -= count * variance / 2 * np.diag([0.5, 2.0])
+    # Noise makes slopes steeper than they are, by half of its variance across and by twice of it down. What neighbours
+    # have in common isn't noise.
+    noise = max(variance - float((left[..., 1:] * left[..., :-1]).sum(dtype=np.float64)) / count, 0)
+    normal[:2, :2] -= count * noise / 2 * np.diag([0.5, 2.0])
     if np.linalg.eigvalsh(normal)[0] <= 0:
         return None
     solution = np.linalg.solve(normal, design.T @ change)
