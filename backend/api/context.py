@@ -66,6 +66,11 @@ class Context:
     pages: PageDesk = field(default_factory=PageDesk)
     """Projector pages; the drivers of page projectors look for theirs here."""
 
+    @property
+    def ticket_name(self) -> str:
+        """Name of the cookie with a projector window's ticket."""
+        return f"{self.cookie_name}-projector"
+
 
 def context_of(connection: HTTPConnection) -> Context:
     """Return the context of the application that serves this connection."""

@@ -88,9 +88,9 @@ async def log_out(request: Request) -> Response:
             raise RefusedError("Another page asked for the logout; use ours.")
         context_of(request).sessions.end(session)
     answer = RedirectResponse("/login", 303)
-    answer.delete_cookie(
-        context_of(request).cookie_name, path="/", httponly=True, samesite="strict"
-    )
+    context = context_of(request)
+    for name in (context.cookie_name, context.ticket_name):
+        answer.delete_cookie(name, path="/", httponly=True, samesite="strict")
     return answer
 
 
@@ -164,19 +164,27 @@ def own_address(address: str) -> str:
     return address if ours and address.isprintable() and "\\" not in address else HOME
 
 
-def _logged_in(request: Request, name: str, token: str, target: str) -> Response:
-    context = context_of(request)
-    cookie, _ = context.sessions.login(name, token, address_of(request))
-    answer = RedirectResponse(target, 303)
+def keep_in_browser(
+    answer: Response, request: Request, name: str, secret: str, *, lifetime_s: float
+) -> None:
+    """Give the browser a secret that no script and no other site can read or send."""
     answer.set_cookie(
-        context.cookie_name,
-        cookie,
-        max_age=int(context.sessions.lifetime_s),
+        name,
+        secret,
+        max_age=int(lifetime_s),
         path="/",
         secure=request.url.scheme == "https",
         httponly=True,
         samesite="strict",
     )
+
+
+def _logged_in(request: Request, name: str, token: str, target: str) -> Response:
+    context = context_of(request)
+    cookie, _ = context.sessions.login(name, token, address_of(request))
+    answer = RedirectResponse(target, 303)
+    lifetime_s = context.sessions.lifetime_s
+    keep_in_browser(answer, request, context.cookie_name, cookie, lifetime_s=lifetime_s)
     return answer
 
 

@@ -4,13 +4,14 @@ import asyncio
 import contextlib
 
 from fastapi import APIRouter, Request, WebSocket
+from starlette.requests import HTTPConnection
 from starlette.responses import HTMLResponse, Response
 from starlette.websockets import WebSocketDisconnect
 
 from backend.api.access import same_origin, session_of
 from backend.api.assets import asset
 from backend.api.context import context_of
-from backend.api.pages import login_by_link, login_page_for
+from backend.api.pages import keep_in_browser, login_by_link, login_page_for
 from backend.api.sessions import Role
 from backend.devices.pages import SECOND_PAGE
 
@@ -25,16 +26,18 @@ async def page(request: Request) -> Response:
     if "token" in request.query_params:
         name = request.query_params.get("name", "")
         return login_by_link(request, f"{PATH}?name={name}" if name else PATH)
-    if session_of(request) is None:
+    if not (session_of(request) or _has_ticket(request)):
         return login_page_for(request)
-    return HTMLResponse(asset("projector.html")[0])
+    answer = HTMLResponse(asset("projector.html")[0])
+    if _may_project(request):
+        _give_ticket(answer, request)
+    return answer
 
 
 @router.websocket("/ws/projector")
 async def socket(browser: WebSocket, name: str = "projector") -> None:
     """Be the projector `name` as long as the page is open."""
-    session = session_of(browser)
-    if session is None or session.role is not Role.OPERATOR or not same_origin(browser):
+    if not (_may_project(browser) and same_origin(browser)):
         await browser.close(1008)  # before accepting it: the browser sees 403
         return
     await browser.accept()
@@ -54,6 +57,25 @@ async def socket(browser: WebSocket, name: str = "projector") -> None:
         sending.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await sending
+
+
+def _may_project(connection: HTTPConnection) -> bool:
+    """Tell whether this window may be a projector: an operator's, also after his session or the server's end."""
+    session = session_of(connection)
+    return session.role is Role.OPERATOR if session else _has_ticket(connection)
+
+
+def _has_ticket(connection: HTTPConnection) -> bool:
+    context = context_of(connection)
+    return context.sessions.tickets.holds(connection.cookies.get(context.ticket_name, ""))
+
+
+def _give_ticket(answer: Response, request: Request) -> None:
+    context = context_of(request)
+    tickets = context.sessions.tickets
+    keep_in_browser(
+        answer, request, context.ticket_name, tickets.issue(), lifetime_s=tickets.lifetime_s
+    )
 
 
 class _Socket:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from backend.api.errors import NotLoggedInError, TooManyAttemptsError
+from backend.api.page_tickets import PageTickets
 
 _log = logging.getLogger(__name__)
 
@@ -139,6 +140,8 @@ class Sessions:
         self._by_station_token: dict[bytes, Session] = {}
         self.closed = asyncio.Event()
         """Set when the server stops: streams of callers without a session end then."""
+        self.tickets = PageTickets(tokens.operator)
+        """What outlives a session: a projector window's right to be the projector."""
 
     @property
     def lifetime_s(self) -> float:

@@ -1,5 +1,7 @@
 """`unglare projector`: the projector page full screen on the projector's monitor."""
 
+import signal
+import sys
 from typing import Annotated
 
 import typer
@@ -49,4 +51,6 @@ def projector(
     typer.echo(
         f"The projector page of {address} is shown on monitor {chosen}. Close it with Alt+F4 or Ctrl+C."
     )
+    # As Ctrl+C does: the window is closed behind the command.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     kiosk.run(chosen, address, name=name, token=token)

@@ -10,7 +10,7 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import urlencode
+from urllib.parse import quote, urlencode
 
 from backend.domain.errors import NotFoundError, StartupError
 
@@ -64,7 +64,7 @@ class Kiosk:
     Parameters
     ----------
     folder
-        Profile of the browser; nobody else's settings and extensions take part.
+        Of the browser's profiles, one per projector; nobody else's settings and extensions take part.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -85,19 +85,20 @@ class Kiosk:
         return monitors[(number or len(monitors)) - 1]
 
     def run(self, monitor: Monitor, address: str, *, name: str, token: str | None) -> None:
-        """Show the page until its window is closed.
+        """Show the page until its window is closed; a window that shows this projector already is closed before.
 
         Raises
         ------
         StartupError
             If no browser is installed.
         """
-        subprocess.run(self.command(monitor, address, name=name, token=token), check=False)  # noqa: S603  our own words
+        with self.opened(monitor, address, name=name, token=token) as browser:
+            browser.wait()
 
     @contextlib.contextmanager
     def opened(
         self, monitor: Monitor, address: str, *, name: str, token: str | None
-    ) -> Iterator[None]:
+    ) -> "Iterator[subprocess.Popen[bytes]]":
         """Show the page as long as the block runs; the window is closed behind it.
 
         A window that a killed command left behind is closed before: its browser would open this page, too, and keep
@@ -109,11 +110,11 @@ class Kiosk:
             If no browser is installed.
         """
         command = self.command(monitor, address, name=name, token=token)
-        self._close_left_over()
+        self._close_left_over(name)
         # In a group of its own: Ctrl+C is the command's, which closes the window when it is done.
         browser = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)  # noqa: S603  our own words
         try:
-            yield
+            yield browser
         finally:
             browser.terminate()
             try:
@@ -122,8 +123,12 @@ class Kiosk:
                 browser.kill()
                 browser.wait()
 
-    def _close_left_over(self) -> None:
-        profile = self._folder / "profile"
+    def profile(self, name: str) -> Path:
+        """Return the folder that the browser keeps for a projector: a browser opens everything of one profile."""
+        return self._folder / f"profile-{quote(name, safe='')}"
+
+    def _close_left_over(self, name: str) -> None:
+        profile = self.profile(name)
         try:
             pid = int((profile / "SingletonLock").readlink().name.rpartition("-")[2])  # HOST-PID
             if (
@@ -159,7 +164,7 @@ class Kiosk:
             *(
                 ["--no-sandbox"] if os.geteuid() == 0 else []
             ),  # it refuses to start as root otherwise
-            f"--user-data-dir={self._folder / 'profile'}",
+            f"--user-data-dir={self.profile(name)}",
             f"--window-position={monitor.left_px},{monitor.top_px}",
             f"--window-size={monitor.width_px},{monitor.height_px}",
             self._door(address, name, token).as_uri(),
@@ -169,7 +174,7 @@ class Kiosk:
         """Write the page that leads on: a token among a program's arguments could be read by everybody."""
         query = {"name": name} | ({"token": token} if token else {})
         target = html.escape(f"{address}/projector?{urlencode(query)}")
-        door = self._folder / "open.html"
+        door = self._folder / f"open-{quote(name, safe='')}.html"
         door.touch(mode=0o600)
         door.write_text(f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">\n')
         return door

@@ -10,6 +10,7 @@ import pytest
 from fastapi import FastAPI
 
 from backend.api import docs, pages, proxy
+from backend.api.sessions import Attempts, Sessions, Tokens
 from tests.contract.api_server import (
     COOKIE,
     OPERATOR_TOKEN,
@@ -198,7 +199,10 @@ def test_a_shown_token_that_is_wrong_counts_although_a_cookie_is_right(address: 
 
 
 def test_who_guesses_too_often_has_to_wait(tmp_path: Path) -> None:
-    with toy_server(tmp_path) as address:
+    # An hour: however slow the machine is, no guess is forgiven before the last one.
+    attempts = Attempts(recovery_s=3600.0)
+    sessions = Sessions(Tokens(OPERATOR_TOKEN, VIEWER_TOKEN), attempts=attempts)
+    with toy_server(tmp_path, sessions=sessions) as address:
         with httpx.Client(base_url=address, trust_env=False) as client, browser(address) as ada:
             statuses = [
                 client.post("/login", data={"name": "Eve", "token": f"guess {i}"}).status_code

@@ -315,3 +315,15 @@ def test_a_page_closed_in_mid_scan_and_opened_again(
         window.page.close()
     with opened_window(desktop, station, playwright):
         ends_or_goes_on(scan)
+
+
+def test_a_server_killed_in_mid_scan_finds_its_window_again(
+    desktop: Desktop, hardware: Program, station: Station, window: Window
+) -> None:
+    scan = station.scan("room", **BRIEF).start("fringe_capture")
+    scan.wait_for_shot(4)
+    station.fall_and_rise()
+    window.page.get_by_text("waits for patterns").wait_for()
+    assert scan.state["job"]["status"] == "interrupted"
+    assert scan.start("fringe_capture").end()["error"] is None
+    assert len(scan.frames()) == 24

@@ -220,14 +220,24 @@ class Station:
             "UNGLARE_STATION": "false",
             "UNGLARE_TOKEN": _TOKEN,
         }
-        program = desktop.unglare("server", "serve", **self._environment)
-        self.address = program.wait_until_it_says(r"(http://[\d.]+:\d+)/\?token").group(1)
+        self.program = self._started()
+        self.address = self.program.wait_until_it_says(r"(http://[\d.]+:\d+)/\?token").group(1)
+        self._environment["UNGLARE_PORT"] = self.address.rpartition(":")[2]
         self.client = httpx.Client(
             base_url=self.address,
             headers={"Authorization": f"Bearer {_TOKEN}"},
             trust_env=False,
             timeout=60,
         )
+
+    def _started(self) -> Program:
+        return self._desktop.unglare("server", "serve", **self._environment)
+
+    def fall_and_rise(self) -> None:
+        """Die as by a power cut, and start again at the same address."""
+        self.program.stop(signal.SIGKILL)
+        self.program = self._started()
+        self.program.wait_until_it_says(r"http://[\d.]+:\d+/\?token")
 
     def close(self) -> None:
         """Hang up."""
@@ -272,11 +282,10 @@ class Station:
     def open_page(self, folder: Path) -> tuple[Program, str]:
         """Show the projector page on the second monitor, as `unglare projector` does; also return DevTools' address."""
         needed("chromium", "chromium")
-        port = folder / "profile" / "DevToolsActivePort"
+        kiosk = Kiosk(folder)
+        port = kiosk.profile("projector") / "DevToolsActivePort"
         port.unlink(missing_ok=True)
-        command = Kiosk(folder).command(
-            self._desktop.second, self.address, name="projector", token=_TOKEN
-        )
+        command = kiosk.command(self._desktop.second, self.address, name="projector", token=_TOKEN)
         # DevTools let a test do what an operator might do to the window.
         program = self._desktop.start("kiosk", [*command, "--remote-debugging-port=0"])
         try:

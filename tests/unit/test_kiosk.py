@@ -44,7 +44,7 @@ def test_the_window_fills_the_monitor_and_the_token_is_no_argument(
         "--force-device-scale-factor=1",
     } <= set(command)
     assert not any("cret" in argument for argument in command)
-    door = tmp_path / "kiosk" / "open.html"
+    door = tmp_path / "kiosk" / "open-left%20one.html"
     assert command[-1] == door.as_uri()
     assert stat.S_IMODE(door.stat().st_mode) == 0o600
     assert "/projector?name=left+one&amp;token=se%26cret" in door.read_text()
@@ -74,7 +74,7 @@ def test_a_window_that_a_killed_command_left_is_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ours: bool
 ) -> None:
     monkeypatch.setattr("backend.services.kiosk.shutil.which", lambda name: "/bin/true")
-    profile = tmp_path / "kiosk" / "profile"
+    profile = Kiosk(tmp_path / "kiosk").profile("wall")
     profile.mkdir(parents=True)
     words = f"--user-data-dir={profile if ours else 'elsewhere'}"
     command = [sys.executable, "-c", "print(1, flush=True); input()", words]
