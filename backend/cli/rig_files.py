@@ -27,7 +27,8 @@ def open_shelf(data: Path | None) -> "RigShelf":
 
 def template(
     kind: Annotated[
-        str, typer.Argument(metavar="KIND", help="stereo-page, mirror-page, lightcrafter or webcam.")
+        str,
+        typer.Argument(metavar="KIND", help="stereo-page, mirror-page, lightcrafter or webcam."),
     ] = "stereo-page",
 ) -> None:
     """Print a rig file to begin with, e.g. unglare rigs template webcam > webcam.yaml."""
