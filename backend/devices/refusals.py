@@ -134,3 +134,24 @@ def refuse_level(display: str, level: int) -> None:
     """
     if not 0 <= level <= 255:
         raise FeatureError(display, f"level {level} is not within 0 to 255; choose another")
+
+
+def cure_of_silence(trigger: TriggerSource, *, triggered: bool) -> str:
+    """Say what to do when no frame comes, after what the camera waits for.
+
+    Parameters
+    ----------
+    trigger
+        What starts its exposures.
+    triggered
+        Whether it was told by software to expose since it was armed.
+    """
+    if trigger is TriggerSource.FREE_RUN:
+        return "check its cable, and reconnect the rig"
+    if trigger is not TriggerSource.SOFTWARE:
+        return f"it waits for pulses on {trigger}: check its trigger cable, and that the projector is wired to that line"
+    return (
+        "it was triggered: check its cable, and reconnect the rig"
+        if triggered
+        else "trigger it first"
+    )

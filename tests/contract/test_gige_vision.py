@@ -181,7 +181,7 @@ def test_what_resending_cannot_save_is_an_incomplete_frame_and_the_next_one_is_w
     [
         (0, TriggerSource.SOFTWARE, "it answers commands, but no packet of its pictures arrives: let UDP .* through"),
         (0, TriggerSource.FREE_RUN, "no packet of its pictures arrives"),
-        (0, TriggerSource.LINE1, "trigger one, or check the line"),
+        (0, TriggerSource.LINE1, "it waits for pulses on Line1: check its trigger cable"),
     ],
 )  # fmt: skip
 def test_why_no_picture_arrives_is_said(addresses, largest_bytes, trigger, sentence):
@@ -194,6 +194,28 @@ def test_why_no_picture_arrives_is_said(addresses, largest_bytes, trigger, sente
         with pytest.raises((DeviceTimeout, IncompleteFrame), match=sentence) as refused:
             camera.get_frame(timeout_s=1.0)
         assert "\n" not in str(refused.value)
+
+
+def test_pictures_that_stop_coming_are_no_matter_of_a_trigger_line(addresses):
+    with network(addresses) as (_, peers), opened(addresses) as camera:
+        camera.arm()
+        with pytest.raises(DeviceTimeout, match="trigger it first"):
+            camera.get_frame(timeout_s=0.1)
+        camera.trigger()
+        camera.get_frame()
+        peers[0]._wire = Wire(largest_bytes=0)
+        camera.trigger()
+        with pytest.raises(DeviceTimeout, match="it was triggered: check its cable"):
+            camera.get_frame(timeout_s=0.5)
+
+
+def test_a_region_that_a_camera_refuses_is_named_with_the_way_out(addresses):
+    with network(addresses):
+        with opened(addresses, region=[0, 0, 160, 120]) as camera:  # as it is: nothing to write
+            assert camera.capabilities.sensor_size == (160, 120)
+        sentence = r"left: Width stays at 160, 128 of region \[0, 0, 128, 96\] is refused \(.*\); leave the region out"
+        with pytest.raises(FeatureError, match=sentence):
+            opened(addresses, region=[0, 0, 128, 96])
 
 
 @pytest.mark.parametrize("asked", [{}, {"packet_bytes": 8000}], ids=["found", "too large"])

@@ -232,6 +232,51 @@ def test_a_tone_curve_that_is_switched_off_is_no_matter():
     assert made.left_on.remaining == ()
 
 
+def test_a_delay_that_cannot_be_shorter_is_no_matter():
+    made, features = controls({**OLD_NAMES, "TriggerDelay": (9.0, 9, 1e6, 0, "us")}, TRIGGER)
+    assert made.left_on.remaining == made.left_on.corrected == ()
+    made, features = controls({**OLD_NAMES, "TriggerDelay": (500.0, 9, 1e6, 0, "us")}, TRIGGER)
+    assert features.numbers["TriggerDelay"] == 9.0
+    assert "TriggerDelay was 500 and is 9 now" in made.left_on.corrected[0]
+
+
+class Running(FakeFeatures):
+    """Still streaming for an owner that was killed, its sequencer in force."""
+
+    is_acquiring = True
+
+    def set_text(self, name: str, value: str) -> None:
+        if self.is_acquiring:
+            raise ValueError(f"{name} is locked while acquisition runs")
+        if self.texts["SequencerMode"] == "On" and name != "SequencerMode":
+            raise ValueError(f"{name} is locked by the sequencer")
+        super().set_text(name, value)
+
+    def run(self, name: str) -> None:
+        super().run(name)
+        self.is_acquiring = self.is_acquiring and name != "AcquisitionStop"
+
+
+def test_a_camera_that_still_runs_is_stopped_before_anything_is_set():
+    features = Running(
+        {**SIZE, **OLD_NAMES},
+        {
+            **FORMAT,
+            **TRIGGER,
+            "SequencerMode": ("On", ("Off", "On")),
+            "ExposureMode": ("TriggerWidth", ("Timed", "TriggerWidth")),
+            "ExposureAuto": ("Continuous", ("Off", "Continuous")),
+        },
+    )
+    made = SfncControls(
+        "left", features, SfncOptions(), buffered_frames=3, hardware_timestamp=False
+    )
+    made.prepare()
+    assert (features.texts["SequencerMode"], features.texts["ExposureAuto"]) == ("Off", "Off")
+    assert features.texts["ExposureMode"] == "Timed"
+    assert len(made.left_on.corrected) == 2
+
+
 def test_what_its_owner_may_have_chosen_is_told_and_left():
     link = {"DeviceLinkThroughputLimitMode": ("On", ("Off", "On"))}
     limit = {"DeviceLinkThroughputLimit": (25e6, 1e6, 380e6, 1, "Bps")}
@@ -246,7 +291,8 @@ def test_what_its_owner_may_have_chosen_is_told_and_left():
 
 def test_triggers_that_would_hold_frames_back_are_switched_off():
     made, features = controls(OLD_NAMES, TRIGGER)
-    assert features.log[: features.log.index(("TriggerSelector", "FrameStart"))] == [
+    triggers = [entry for entry in features.log if entry[0].startswith("Trigger")]
+    assert triggers[: triggers.index(("TriggerSelector", "FrameStart"))] == [
         ("TriggerSelector", "AcquisitionStart"),
         ("TriggerMode", "Off"),
     ]
@@ -284,7 +330,7 @@ def test_a_camera_opens_with_the_format_of_the_rig_file():
 
 
 def test_a_region_is_set_from_the_corner_outwards():
-    offsets = {"OffsetX": (64.0, 0, 600, 16, ""), "OffsetY": (0.0, 0, 400, 1, "")}
+    offsets = {"OffsetX": (64.0, 0, 600, 16, ""), "OffsetY": (8.0, 0, 400, 1, "")}
     _, features = controls({**OLD_NAMES, **offsets}, TRIGGER, region=[32, 10, 320, 200])
     set_numbers = [(name, value) for name, value in features.log if name in (*SIZE, *offsets)]
     assert set_numbers == [

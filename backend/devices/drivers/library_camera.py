@@ -31,7 +31,12 @@ from backend.devices.protocols import (
     Range,
     TriggerSource,
 )
-from backend.devices.refusals import refuse_impossible, refuse_locked, refuse_trigger
+from backend.devices.refusals import (
+    cure_of_silence,
+    refuse_impossible,
+    refuse_locked,
+    refuse_trigger,
+)
 
 log = logging.getLogger(__name__)
 
@@ -284,9 +289,7 @@ class LibraryCamera(Link):
     @property
     def _cure(self) -> str:
         """What to do when no frame comes."""
-        if self._settings.trigger is TriggerSource.FREE_RUN:
-            return "take it again"
-        return "trigger one, or check the line"
+        return cure_of_silence(self._settings.trigger, triggered=self._due_at_s > 0)
 
     def disarm(self) -> None:
         """Stop acquisition."""

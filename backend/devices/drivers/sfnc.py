@@ -10,7 +10,13 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 from pydantic import Field
 
-from backend.devices.drivers.sfnc_overruling import LeftOn, overrule, overrule_trigger, told
+from backend.devices.drivers.sfnc_overruling import (
+    LeftOn,
+    overrule,
+    overrule_sequencer,
+    overrule_trigger,
+    told,
+)
 from backend.devices.errors import FeatureError, UnsupportedFeature
 from backend.devices.options import DeviceOptions
 from backend.devices.protocols import CameraCapabilities, CameraSettings, Range, TriggerSource
@@ -141,11 +147,15 @@ class SfncControls:
     def prepare(self) -> None:
         """Overrule what else was set before us: automatics off, one trigger per frame, a format that we read."""
         features = self._features
+        # A former owner that was killed left it running, and most cameras lock their settings meanwhile.
+        with suppress(Exception):  # one that stands still may refuse to be stopped
+            features.run("AcquisitionStop")
+        self.left_on = overrule_sequencer(self._camera, features)
         for name, value in (
             ("AcquisitionMode", "Continuous"), ("ExposureMode", "Timed"), ("GainSelector", "All"),
         ):  # fmt: skip
             self._set_if_possible(name, value)
-        self.left_on = overrule(self._camera, features)
+        self.left_on += overrule(self._camera, features)
         self._choose_format()
         self._read_region()
         for selector in features.choices("TriggerSelector"):  # another one may hold frames back
@@ -192,7 +202,21 @@ class SfncControls:
                     self._camera,
                     f"{name} {value} of region {list(region)} is not within {allowed} in steps of {step:g}; choose another",
                 )
+            if self._features.number(name) != value:
+                self._set_region(name, value)
+
+    def _set_region(self, name: str, value: int) -> None:
+        try:
             self._features.set_number(name, value)
+        except Exception as error:
+            now = self._features.number(
+                name
+            )  # fails where the camera is gone: then that is what is told
+            raise FeatureError(
+                self._camera,
+                f"{name} stays at {now:g}, {value} of region {list(self._options.region or ())} is"
+                f" refused ({' '.join(str(error).split())}); leave the region out, or set it in the vendor's viewer",
+            ) from error
 
     def notes(self) -> tuple[str, ...]:
         """Say what was set otherwise than found, and what its owner should know of; after `prepare`."""

@@ -6,7 +6,7 @@ refused.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 from backend.devices.errors import FeatureError
@@ -36,6 +36,10 @@ class Overruled(Protocol):
         """Tell whether something is on."""
         ...
 
+    def bounds(self, name: str) -> tuple[float, float, float]:
+        """Return smallest, largest and step (0: any) of a number."""
+        ...
+
     def set_text(self, name: str, value: str) -> None:
         """Set an enumeration."""
         ...
@@ -61,12 +65,14 @@ class _Rule:
     otherwise: str
     needed: bool = False
     """A camera where it can't be set so is refused."""
+    or_nearest: bool = False
+    """Where the camera can't do this number, the nearest that it can do is as good."""
 
 
+_SEQUENCER = (_Rule("SequencerMode", "Off", "exposures change from frame to frame", needed=True),)
 _RULES = (
     _Rule("ExposureAuto", "Off", "exposures change from frame to frame", needed=True),
     _Rule("GainAuto", "Off", "gains change from frame to frame", needed=True),
-    _Rule("SequencerMode", "Off", "exposures change from frame to frame", needed=True),
     _Rule("TestPattern", "Off", "its pictures are test images", needed=True),
     _Rule("TestImageSelector", "Off", "its pictures are test images", needed=True),
     _Rule("BlackLevelAuto", "Off", "dark pixels change from frame to frame"),
@@ -82,8 +88,9 @@ _RULES = (
     _Rule("AcquisitionFrameRateEnabled", False, "triggers that come faster are passed over"),
 )
 _OF_A_TRIGGER = (
-    _Rule("TriggerDelay", 0.0, "it exposes later than it is told to"),
-    _Rule("TriggerDelayAbs", 0.0, "it exposes later than it is told to"),
+    # Some cameras can't do less than a few microseconds.
+    _Rule("TriggerDelay", 0.0, "it exposes later than it is told to", or_nearest=True),
+    _Rule("TriggerDelayAbs", 0.0, "it exposes later than it is told to", or_nearest=True),
 )
 _TONE_CURVES = (
     # Without a switch of its own. Selectors first: a gamma of 1 counts only where it is the user's that is in force.
@@ -107,6 +114,17 @@ class LeftOn:
         return LeftOn(self.corrected + more.corrected, self.remaining + more.remaining)
 
 
+def overrule_sequencer(camera: str, features: Overruled) -> LeftOn:
+    """Do so with the sequencer, before anything else is set: while it runs it locks what it sets, automatics included.
+
+    Raises
+    ------
+    FeatureError
+        If it can't be switched off.
+    """
+    return _overruled(camera, features, _SEQUENCER)
+
+
 def overrule(camera: str, features: Overruled) -> LeftOn:
     """Set what a scan needs otherwise than it is.
 
@@ -126,7 +144,7 @@ def overrule_trigger(camera: str, features: Overruled) -> LeftOn:
 def _overruled(camera: str, features: Overruled, rules: tuple[_Rule, ...]) -> LeftOn:
     corrected: list[str] = []
     remaining: list[str] = []
-    for rule in rules:
+    for rule in (_reachable(features, rule) for rule in rules):
         if (
             rule in _TONE_CURVES
             and features.has("GammaEnable")
@@ -150,6 +168,14 @@ def _overruled(camera: str, features: Overruled, rules: tuple[_Rule, ...]) -> Le
             raise FeatureError(camera, problem)
         remaining.append(f"{camera}: {problem}.")
     return LeftOn(tuple(corrected), tuple(remaining))
+
+
+def _reachable(features: Overruled, rule: _Rule) -> _Rule:
+    """Return a rule as far as the camera can follow it, where that is enough."""
+    if not (rule.or_nearest and isinstance(rule.value, float) and features.has(rule.feature)):
+        return rule
+    low, high, _ = features.bounds(rule.feature)
+    return replace(rule, value=min(max(rule.value, low), high))
 
 
 def _found(features: Overruled, rule: _Rule) -> Value | None:

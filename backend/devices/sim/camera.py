@@ -24,7 +24,12 @@ from backend.devices.protocols import (
     Range,
     TriggerSource,
 )
-from backend.devices.refusals import refuse_impossible, refuse_locked, refuse_trigger
+from backend.devices.refusals import (
+    cure_of_silence,
+    refuse_impossible,
+    refuse_locked,
+    refuse_trigger,
+)
 from backend.devices.sim.clock import Clock
 from backend.devices.sim.link import SimulatedLink
 from backend.devices.sim.renderer import Light
@@ -286,10 +291,8 @@ class SimulatedCamera(SimulatedLink):
             if self._aborted.is_set():
                 raise DeviceTimeout(self.name, "waiting for a frame was aborted; arm again")
             if not self._queue:
-                raise DeviceTimeout(
-                    self.name,
-                    f"no frame came within {timeout_s:g} s; trigger one, or check the line",
-                )
+                cure = cure_of_silence(self._settings.trigger, triggered=False)
+                raise DeviceTimeout(self.name, f"no frame came within {timeout_s:g} s; {cure}")
             return self._queue.popleft()
 
 
