@@ -181,7 +181,7 @@ function connect() {
       return say("Another page is this projector already: close one of them and reload.", "Another projector? Give it a page of its own: /projector?name=…");
     }
     if (wasOpen) say("The connection to unglare is lost; connecting again …");
-    else whyRefused().then(say);
+    else whyRefused().then((text) => { if (socket.readyState !== WebSocket.OPEN) say(text); }); // a later try may have worked
     wasOpen = false;
     setTimeout(connect, delay);
     delay = Math.min(2 * delay, 5000);

@@ -174,6 +174,35 @@ def test_a_reload_is_noticed_and_patterns_come_back(page: Page, desk: PageDesk) 
         np.testing.assert_array_equal(seen(page, shown[2].shape), shown[2])
 
 
+ANSWERED_LATE = """
+    const Socket = WebSocket;
+    let is_first = true;
+    window.WebSocket = class extends Socket {
+      constructor(url) { super(is_first ? url.replace("/ws/projector", "/ws/nowhere") : url); is_first = false; }
+    };
+    window.fetch = () => new Promise((answer) => {
+      window.answer = () => answer(new Response("", { status: 401 }));
+    });
+"""
+
+
+def test_why_it_was_refused_is_not_written_over_patterns_that_came_since(
+    browser: BrowserContext, address: str, desk: PageDesk
+) -> None:
+    page = browser.new_page()
+    page.add_init_script(ANSWERED_LATE)
+    page.goto(f"{address}/projector?token={OPERATOR_TOKEN}")
+    with opened(desk) as projector:
+        shown = patterns(*true_size(desk))[:1]
+        projector.load(shown)
+        projector.show(0)
+        page.evaluate(
+            "async () => { answer(); await new Promise((later) => setTimeout(later, 50)); }"
+        )
+        np.testing.assert_array_equal(seen(page, shown[0].shape), shown[0])
+    page.close()
+
+
 def test_a_frozen_page_times_out_and_works_again(page: Page, desk: PageDesk) -> None:
     with opened(desk) as projector:
         projector.blank(0)
