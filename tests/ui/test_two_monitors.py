@@ -38,6 +38,7 @@ pytestmark = pytest.mark.ui
 
 WORLD: dict[str, Any] = {"scene": "plane", "size": "320x240", "seed": 5}
 MOST_COLUMN_ERROR_PX = 0.02
+NOBODY = ""
 BRIEF: dict[str, dict[str, Any]] = {"exposures": {"exposures_ms": [50.0]}}
 """One exposure: 12 shots."""
 
@@ -68,6 +69,7 @@ def simulated(desktop: Desktop, station: Station, name: str, *more: str) -> Iter
         program.wait_until_it_says("Stop with Ctrl")
         station.add_rig(desktop.folder / f"{name}.yaml", name)
         yield program
+        station.give_page_to(NOBODY)  # closing a rig whose cameras are gone takes their timeouts
     finally:
         status = program.stop(signal.SIGINT)
     assert status == 0, program.said
