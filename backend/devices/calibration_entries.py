@@ -13,7 +13,7 @@
         t_mm: [0, -250.9, 456.6]
 
 Every pose is `x_device = R x_world + t_mm`, as OpenCV has it; the world is the reference camera's frame unless that
-camera's pose says otherwise.
+camera's pose says otherwise. Three digits do for R: the rotation next to it is taken.
 """
 
 from collections.abc import Iterator, Mapping
@@ -34,6 +34,8 @@ ScreenPoint = Annotated[
 ]
 
 _SAME_PLACE_MM = 1e-6
+_EXACT, _ROUNDED = 1e-6, 2e-3
+"""By how much rows may fail to be orthonormal: as a program writes them, or a person with three digits."""
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
 
@@ -45,9 +47,14 @@ class CalibrationPart(BaseModel):
 
 def _rotates(value: _Matrix) -> _Matrix:
     R = np.array(value)
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+    deviation = np.abs(R @ R.T - np.eye(3)).max()
+    if deviation > _ROUNDED or np.linalg.det(R) < 0:
         raise ValueError("it is no rotation: its rows have to be orthonormal and right-handed")
-    return value
+    if deviation <= _EXACT:
+        return value  # to the last bit: calibrations are compared by it
+    u, _, vt = np.linalg.svd(R)
+    first, second, third = (u @ vt).tolist()
+    return tuple(first), tuple(second), tuple(third)
 
 
 class ViewEntry(CalibrationPart):

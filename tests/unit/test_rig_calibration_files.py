@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from backend.cli.application import run
-from backend.devices.calibration_entries import CalibrationEntry
+from backend.devices import calibration_entries
+from backend.devices.calibration_entries import CalibrationEntry, PoseEntry
 from backend.devices.errors import RigConfigError
 from backend.devices.pages import PageDesk
 from backend.devices.rig_file import RigFile
@@ -129,6 +130,21 @@ def test_a_projector_is_added_to_two_cameras_by_the_one_that_saw_it(tmp_path: Pa
 
 
 SCREEN = "screen: {width_px: 64, height_px: 48, pixel_pitch_mm: 0.5, R: [[-1, 0, 0], [0, 1, 0], [0, 0, -1]], t_mm: [0, -9, 400]}"
+
+
+def test_the_example_of_the_description_is_a_calibration() -> None:
+    """Its rotation has three digits, as somebody types it."""
+    example = (calibration_entries.__doc__ or "").split("::\n")[1].split("\n\nEvery pose")[0]
+    entry = CalibrationEntry.model_validate(yaml.safe_load(example)["calibration"])
+    assert entry.screen is not None
+    pose = entry.screen.device_from_world
+    np.testing.assert_allclose(pose.R @ pose.R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(pose.R[1], [0, np.cos(np.pi / 6), 0.5], atol=5e-4)
+
+
+def test_the_rotation_of_a_program_stays_to_the_last_bit() -> None:
+    entry = {"R": (R + 1e-9).tolist(), "t_mm": [0.0, 0.0, 0.0]}
+    assert PoseEntry.model_validate(entry).R == tuple(map(tuple, entry["R"]))
 
 
 def test_a_screen_is_added_to_a_camera(tmp_path: Path) -> None:
