@@ -359,9 +359,8 @@ def test_a_camera_that_hangs_costs_no_answer(bench: Bench) -> None:
         took_s.append(time.perf_counter() - began_s)
 
     assert not hold.is_set(), "the camera hangs still"
-    assert (
-        sorted(took_s)[len(took_s) // 2] < 2.0
-    )  # 10 ms where nothing else runs; whoever waits, waits for 10 s
+    # Each, not most: 10 ms where nothing else runs. Whoever waits for a device has 3 s of patience at least.
+    assert max(took_s) < 2.5
     until(lambda: bench.state()["link"] == "closed")
 
 
