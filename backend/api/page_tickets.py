@@ -8,8 +8,11 @@ import hashlib
 import hmac
 import time
 from collections.abc import Callable
+from functools import cached_property
 
 _PURPOSE = b"unglare projector page"
+_GUESSING_COST = 2**12
+"""Of `hashlib.scrypt`, about 10 ms: whoever gets hold of a ticket could try out short tokens on it, past the login's limit."""
 
 
 class PageTickets:
@@ -32,7 +35,7 @@ class PageTickets:
         lifetime_s: float = 30 * 24 * 3600.0,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._key = hmac.digest(operator_token.encode("utf-8", "surrogatepass"), _PURPOSE, "sha256")
+        self._token = operator_token.encode("utf-8", "surrogatepass")
         self._lifetime_s = lifetime_s
         self._clock = clock
 
@@ -56,6 +59,10 @@ class PageTickets:
             signature.encode("utf-8", "surrogatepass"), self._signature(int(until)).encode()
         )
         return genuine and self._clock() < int(until)
+
+    @cached_property
+    def _key(self) -> bytes:
+        return hashlib.scrypt(self._token, salt=_PURPOSE, n=_GUESSING_COST, r=8, p=1, dklen=32)
 
     def _signature(self, until_s: int) -> str:
         return hmac.new(self._key, str(until_s).encode(), hashlib.sha256).hexdigest()

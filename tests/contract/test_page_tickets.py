@@ -1,5 +1,6 @@
 """A projector window stays one when the sessions are gone, and gets nothing else by it."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -103,6 +104,16 @@ def test_a_ticket_runs_out() -> None:
     assert not tickets.holds(ticket)
     until, signature = ticket.split(".")
     assert not tickets.holds(f"{int(until) + int(LATER_S)}.{signature}")
+
+
+def test_trying_out_tokens_on_a_ticket_takes_long() -> None:
+    ticket = PageTickets(OPERATOR_TOKEN).issue()
+    took_s = []
+    for guess in ("password", "12345678", "unglare1"):
+        began_s = time.perf_counter()
+        assert not PageTickets(guess).holds(ticket)
+        took_s.append(time.perf_counter() - began_s)
+    assert min(took_s) > 1e-3
 
 
 @given(st.text(max_size=90))
