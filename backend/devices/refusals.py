@@ -147,7 +147,7 @@ def cure_of_silence(trigger: TriggerSource, *, triggered: bool) -> str:
         Whether it was told by software to expose since it was armed.
     """
     if trigger is TriggerSource.FREE_RUN:
-        return "check its cable, and reconnect the rig"
+        return "take it again"
     if trigger is not TriggerSource.SOFTWARE:
         return f"it waits for pulses on {trigger}: check its trigger cable, and that the projector is wired to that line"
     return (
