@@ -8,7 +8,7 @@ import numpy as np
 from backend.devices.sim.chains import FULL_WELL_E, READ_NOISE_E, Chain
 from backend.domain.frames import Frame, InMemory
 from backend.domain.rig import CameraFacts, ProjectorFacts, RigFacts
-from backend.domain.shots import Exposed, Plan, Shot, Until
+from backend.domain.shots import Exposed, OneOf, Plan, Shot, Until
 from backend.jobs.rendering import render
 
 T = TypeVar("T")
@@ -34,7 +34,8 @@ class ChainRig:
             wanted = next(plan)
             while True:
                 assert not isinstance(wanted, Until)
-                wanted = plan.send(tuple(self.expose(shot) for shot in wanted))
+                burst = wanted.burst if isinstance(wanted, OneOf) else wanted
+                wanted = plan.send(tuple(self.expose(shot) for shot in burst))
         except StopIteration as end:
             result: T = end.value
             return result

@@ -44,7 +44,19 @@ class Until:
     timeout_s: float = 120.0
 
 
-Plan = Generator[Burst | Until, tuple[Exposed, ...], T]
+@dataclass(frozen=True)
+class OneOf:
+    """A burst that is one of several alike, so that whoever waits is told how far all of them are."""
+
+    burst: Burst
+    number: int
+    """From 0."""
+    count: int
+    word: str = "burst"
+    """What operators call one of them."""
+
+
+Plan = Generator[Burst | OneOf | Until, tuple[Exposed, ...], T]
 """Yields bursts, receives one `Exposed` per shot (a single one after `Until`), returns what it learnt."""
 
 

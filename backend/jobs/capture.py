@@ -7,7 +7,7 @@ plans are deterministic, so the same frames lead to the same shots.
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -23,15 +23,15 @@ from backend.domain.errors import (
     InvalidCaptureError,
     RigFailedError,
     StageFailedError,
-    StorageFullError,
 )
-from backend.domain.frames import Frame, InMemory, Pixels
+from backend.domain.frames import Frame, InMemory, Pixels, identity
 from backend.domain.patterns import Pattern
 from backend.domain.rig import RigFacts
-from backend.domain.shots import Burst, Exposed, Plan, Shot, Until
+from backend.domain.shots import Burst, Exposed, OneOf, Plan, Shot, Until
 from backend.jobs.control import JobControl
 from backend.jobs.evidence import KeepEvidence, chosen, no_evidence
 from backend.jobs.journal import Journal, shot_document, shot_hash
+from backend.jobs.pace import Pace, Series
 from backend.jobs.rendering import render
 from backend.jobs.shooting import Shooter, Take
 from backend.jobs.sync_checks import TRIES, SyncWatch
@@ -112,11 +112,13 @@ class CaptureSession:
     """Where frames go that couldn't be verified."""
     clock: Callable[[], float] = time.monotonic
     _occurrences: Counter[str] = field(default_factory=Counter, init=False)
-    _masks: dict[int, tuple[Pixels, str]] = field(default_factory=dict, init=False)
+    _masks: dict[Hashable, tuple[Pixels, str]] = field(default_factory=dict, init=False)
     _loaded: tuple[str, ...] = field(default=(), init=False)
     _watch: SyncWatch = field(init=False)
     _unverified: int = field(default=0, init=False)
     """Frames that are kept as evidence."""
+    _series: Series = field(default_factory=Series, init=False)
+    """The bursts that the present one is one of."""
 
     def __post_init__(self) -> None:
         """Watch over what is captured, unless its light is certain."""
@@ -171,9 +173,13 @@ class CaptureSession:
         self.control.shots(None, "a last look at the light", None)
         return self.shooter.take_all([self._take_of(planned)])[0]
 
-    def _answer(self, request: Burst | Until) -> tuple[Exposed, ...]:
+    def _answer(self, request: Burst | OneOf | Until) -> tuple[Exposed, ...]:
         if isinstance(request, Until):
             return (self._until(request),)
+        if isinstance(request, OneOf):
+            self._series = self._series.followed_by(request)
+            return self._burst(request.burst)
+        self._series = Series()
         return self._burst(request)
 
     # bursts
@@ -232,7 +238,9 @@ class CaptureSession:
         """Expose unit after unit; one whose frames aren't right is taken again, a few times."""
         assert self.shooter is not None  # `_load` refused otherwise
         planned = [p for unit in units for p in unit.planned]
-        pace = _Pace([p.shot.exposure_ms for p in planned], self.clock)
+        pace = Pace([p.shot.exposure_ms for p in planned], self.clock)
+        if self._series.count > 1 and not kept:
+            self._series = self._series.begun(self.clock())
         done = 0
         chunks = self.shooter.chunks([self._take_of(p) for p in planned])
         waiting: deque[_Frames] = deque()
@@ -270,7 +278,7 @@ class CaptureSession:
             if len(violations) == 1:
                 first = unit, frames
             if len(violations) == TRIES:
-                error = self._out_of_sync(violations)
+                error = self._out_of_sync(violations, [p.shot for p in first[0].planned], burst)
                 self._keep_evidence(error, first[0].planned, first[1], violations[0].number)
                 raise error
             self.control.note(f"{violation.camera}: {violation.sentence}; taken again")
@@ -281,7 +289,11 @@ class CaptureSession:
             unit = self._watch.again(unit)
             takes = [self._take_of(planned) for planned in unit.planned]
             chunks = self.shooter.chunks(takes)
-            frames = [taken for chunk in chunks for taken in self.shooter.take_all(chunk)]
+            try:
+                frames = [taken for chunk in chunks for taken in self.shooter.take_all(chunk)]
+            except DeviceError as error:
+                self._keep_evidence(error, first[0].planned, first[1], violations[0].number)
+                raise
 
     def _keep_evidence(
         self,
@@ -307,25 +319,34 @@ class CaptureSession:
             ]
             if documents and self.evidence(error.sentence, documents):
                 self._unverified += len(documents)
-        except StorageFullError as full:
-            log.warning("Frames that couldn't be verified aren't kept: %s", full)
+        except Exception as hindrance:  # noqa: BLE001  a full disk, a scan that is gone: the error that led here says more
+            log.warning("Frames that couldn't be verified aren't kept: %s", hindrance)
 
     def _recall(self, rows: Iterable[FrameRow]) -> None:
         """Take in what was found of frames when they came: a verdict that holds for whatever is made of them."""
         for row in rows:
             self._watch.recall(row.metadata)
 
-    def _out_of_sync(self, violations: Sequence[Violation]) -> OutOfSync:
-        """Say which frame was wrong first, and what is to blame."""
+    def _out_of_sync(
+        self, violations: Sequence[Violation], shots: Sequence[Shot], burst: Sequence[Shot]
+    ) -> OutOfSync:
+        """Say which frame was wrong first, and what is to blame; `shots` are those that were looked at with it."""
         assert self.shooter is not None  # `_load` refused otherwise
+        first = violations[0]
+        cause = self._watch.blame(violations)
+        if first.number is not None:
+            shots = [burst[first.number]]
+        off_grid = (self.shooter.off_grid(first.camera, s.exposure_ms) for s in shots)
+        grid = "" if cause is Cause.STILL else next(filter(None, off_grid), "")
         reason = {
             Cause.DISPLAY: f"{_DISPLAY}; {self.shooter.way_out}",
             Cause.LIGHT: f"{_LIGHT}; {_STEADY}",
             Cause.STILL: f"{_STILL}; {self.shooter.way_out}",
             Cause.CAMERA: f"{_EARLIER}; {_ALONE}",
             Cause.UNKNOWN: f"{_DISPLAY}, or the room's light has changed; {self.shooter.way_out}",
-        }[self._watch.blame(violations)]
-        first = violations[0]
+        }[cause]
+        if grid:
+            reason = f"{grid}; if that isn't it, {reason}"
         return OutOfSync(
             first.camera,
             f"{first.sentence}, and taken again it wasn't right in {TRIES} tries: {reason}",
@@ -468,7 +489,7 @@ class CaptureSession:
                     return {share.camera: row for share, row in zip(shares, rows, strict=True)}
                 violations.append(violation)
                 if len(violations) == TRIES:
-                    error = self._out_of_sync(violations)
+                    error = self._out_of_sync(violations, burst, burst)
                     self._keep_evidence(error, unit.planned, shown)
                     raise error
                 self.control.note(f"{violation.camera}: {violation.sentence}; taken again")
@@ -518,23 +539,25 @@ class CaptureSession:
         """Identify a mask by its content; the store keeps it, so that the journal can be understood."""
         if mask is None or isinstance(mask, StoredPixels):
             return mask.hash if mask else None
-        if id(mask) not in self._masks:
+        known = identity(mask)
+        if known not in self._masks:
             # Keeping the mask keeps its id from being given to another one.
-            self._masks[id(mask)] = (mask, self.store.put(mask.load()).hash)
-        return self._masks[id(mask)][1]
+            self._masks[known] = (mask, self.store.put(mask.load()).hash)
+        return self._masks[known][1]
 
     # words
 
     def _tell(
-        self, pace: "_Pace", done: int, planned: Sequence[Planned], size: int, *, kept: int
+        self, pace: Pace, done: int, planned: Sequence[Planned], size: int, *, kept: int
     ) -> None:
         """Tell how far a burst is; what is exposed besides is passed over."""
         before = kept + sum(p.number is not None for p in planned[:done])
         following = (p for p in planned[done:] if p.number is not None)
         shot = next(following, planned[done]).shot
-        share = before / size if size > 1 else None
-        text = f"{_named(shot)}, {min(before + 1, size)} of {size}"
-        self.control.shots(share, text, pace.remaining_s(done))
+        series = self._series
+        share = series.share(before / size) if size > 1 or series.count > 1 else None
+        text = f"{series.prefix}{_named(shot)}, {min(before + 1, size)} of {size}"
+        self.control.shots(share, text, series.remaining_s(pace.remaining_s(done), self.clock))
 
     def _failed(self, error: DeviceError) -> RigFailedError:
         kept = len(self.journal)
@@ -585,25 +608,3 @@ def _is_plain(value: object) -> bool:
     if isinstance(value, float):
         return isfinite(value)
     return isinstance(value, str | int | bool)
-
-
-class _Pace:
-    """Estimates how long the rest of a burst takes: its light time, and what each shot took on top so far."""
-
-    def __init__(self, exposures_ms: Sequence[float], clock: Callable[[], float]) -> None:
-        self._light_s = np.concatenate([[0.0], np.cumsum(exposures_ms) / 1000.0])
-        self._clock = clock
-        self._began = clock()
-
-    def remaining_s(self, done: int) -> float | None:
-        """Return the seconds left after `done` shots; None before the first, and for a single shot."""
-        count = len(self._light_s) - 1
-        if done == 0 or count == 1:
-            return None
-        light_s = self._light_s[done]
-        left_s = self._light_s[-1] - light_s
-        elapsed_s = self._clock() - self._began
-        if elapsed_s < light_s:
-            # Faster than light: a simulated rig doesn't wait for its exposures.
-            return float(left_s * elapsed_s / light_s)
-        return float(left_s + (elapsed_s - light_s) / done * (count - done))

@@ -5,6 +5,7 @@ import random
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
+from backend.domain.frames import identity
 from backend.domain.patterns import (
     BLACK,
     WHITE,
@@ -261,7 +262,7 @@ def _uniform_kind(shot: Shot, count: int) -> SetKind:
 
 
 def _light(shot: Shot) -> tuple[Hashable, ...]:
-    return shot.exposure_ms, shot.gain_db, id(shot.mask)
+    return shot.exposure_ms, shot.gain_db, None if shot.mask is None else identity(shot.mask)
 
 
 def _fringe(sine: Sine) -> tuple[Hashable, ...]:

@@ -13,7 +13,7 @@ from backend.domain.hints import Frames, Mask, Picture, Value
 from backend.domain.params import setting
 from backend.domain.patterns import WHITE, Gray, Pattern, Stripe
 from backend.domain.rig import RigCalibration, RigFacts
-from backend.domain.shots import Burst, Exposed, Plan, Shoot, Shot
+from backend.domain.shots import Burst, Exposed, OneOf, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Level, Review
 from backend.numerics.code_certainty import PairGeometry, on_epipolar_line
@@ -39,6 +39,8 @@ _TARGET = 0.85
 """Share of the full scale that the second look may bring a pixel to."""
 _MOST_RAISE = np.float32(6.0)
 _SMOOTHING_PX = 3.0
+_BESIDES_S = 0.1
+"""What a picture takes besides its exposure: until a display has drawn and settled, and a frame has come."""
 _UNTOLD, _SECOND_LIGHT, _TOLD_NOW = 1, 2, 3
 LABELS = {
     _UNTOLD: "no code that agrees with the calibration, or none at all",
@@ -68,6 +70,9 @@ class SecondLookParams(EdgesParams):
     )
     """Automatic: as long as half of the pixels looked at need for the brightness that is aimed at, with the
     projector at its brightest for them."""
+    budget_s: float = setting(600.0, title="Time budget", unit="s", gt=0, le=36_000)
+    """Of all looks, each picture with 0.1 s besides its exposure: where that doesn't suffice, those looks are taken
+    that most pixels wait for."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +97,22 @@ class SecondLook:
     """Pixels whose second code is to be used."""
     frames: Annotated[tuple[Frame, ...], Frames("Code of the second look")] = ()
     exposure_ms: Annotated[float, Value("Exposure of the looks", unit="ms")] = float("nan")
+    left_out: Annotated[int, Value("Looks left out for want of time")] = 0
+    whole_s: Annotated[float, Value("Time of all looks", unit="s")] = float("nan")
+    """Expected, those left out included."""
 
 
 def _told(result: SecondLook, params: SecondLookParams) -> Check:
     sentence = f"{result.before_share:.2%} of the lit pixels are untold or lit from two places"
     if result.codes is not None:
         sentence += f", {result.after_share:.2%} after a second look"
-    return Check("told", Level.OK, sentence, result.after_share, params.few)
+    if not result.left_out:
+        return Check("told", Level.OK, sentence, result.after_share, params.few)
+    sentence += (
+        f"; {result.left_out} of {result.left_out + result.looks} looks were left out: all of them take about"
+        f" {result.whole_s:.0f} s, the time budget is {params.budget_s:g} s, raise it or open the aperture"
+    )
+    return Check("told", Level.WARNING, sentence, result.after_share, params.few)
 
 
 @stage(title="Second look", version=2, review=Review.ON_WARNING, checks=(_told,))
@@ -190,20 +204,40 @@ class _Look:
         picture = _Composite(self.name, self.patterns, self.own)
         depths_mm = self._depths_mm()
         raised, exposure_ms = self._exposed(self._raised(alone, wanted), wanted)
-        for number in range(self.params.bands):
+        numbers = self._numbers(wanted)
+        chosen = self._within_budget(numbers, exposure_ms)
+        for place, number in enumerate(chosen):
             pixels = wanted & (self.own == number)
             factor = self._factor(number, raised, pixels, depths_mm)
             if not factor.any():
                 continue
-            exposed = yield tuple(
+            burst = tuple(
                 self._shot(pattern, factor, exposure_ms, (self.name,)) for pattern in self.patterns
             )
+            exposed = yield OneOf(burst, place, len(chosen), "look")
             picture.take_in(exposed, number)
+        left_out = len(numbers) - len(chosen)
+        whole_s = len(numbers) * self._look_s(exposure_ms)
         if not picture.frames:
-            return self._result(second, wanted)
-        codes = edges(picture.code(), IntensityMask(raised), self.facts, self.params, _silent)
-        told = self._told_now(codes, wanted, depths_mm)
-        return self._result(second, wanted, told, picture, exposure_ms)
+            result = self._result(second, wanted)
+        else:
+            codes = edges(picture.code(), IntensityMask(raised), self.facts, self.params, _silent)
+            told = self._told_now(codes, wanted & np.isin(self.own, chosen), depths_mm)
+            result = self._result(second, wanted, told, picture, exposure_ms)
+        return replace(result, left_out=left_out, whole_s=whole_s)
+
+    def _numbers(self, wanted: Bool[np.ndarray, "h w"]) -> list[int]:
+        """Return the looks that pixels wait for, those that most wait for first."""
+        waiting = np.bincount(self.own[wanted], minlength=self.params.bands)
+        order = np.argsort(-waiting, kind="stable")
+        return [int(number) for number in order if waiting[number]]
+
+    def _look_s(self, exposure_ms: float) -> float:
+        return len(self.patterns) * (exposure_ms / 1000.0 + _BESIDES_S)
+
+    def _within_budget(self, numbers: list[int], exposure_ms: float) -> list[int]:
+        """Return those looks that there is time for, in the order in which they are taken."""
+        return sorted(numbers[: int(self.params.budget_s / self._look_s(exposure_ms))])
 
     # what is captured
 

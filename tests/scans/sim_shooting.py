@@ -7,7 +7,7 @@ from typing import Any
 
 from backend.devices.sim import create_rig
 from backend.domain.frames import Frame, InMemory
-from backend.domain.shots import Burst, Exposed, Plan
+from backend.domain.shots import Burst, Exposed, OneOf, Plan, Until
 from backend.jobs.control import JobControl
 from backend.jobs.rendering import render
 from backend.jobs.shooting import Shooter
@@ -25,8 +25,9 @@ class SimShoot:
         try:
             burst = next(plan)
             while True:
-                assert isinstance(burst, tuple)
-                burst = plan.send(self._burst(burst))
+                assert not isinstance(burst, Until)
+                shots = burst.burst if isinstance(burst, OneOf) else burst
+                burst = plan.send(self._burst(shots))
         except StopIteration as end:
             return end.value
 

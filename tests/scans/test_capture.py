@@ -36,7 +36,7 @@ from backend.domain.patterns import (
     Stripe,
     Uniform,
 )
-from backend.domain.shots import Exposed, Plan, Shot, Until
+from backend.domain.shots import Exposed, OneOf, Plan, Shot, Until
 from backend.jobs import shooting
 from backend.jobs.capture import CaptureSession
 from backend.jobs.control import JobControl, Live
@@ -533,6 +533,28 @@ def test_resumed_progress_starts_where_it_was(bench: Bench) -> None:
     told = [live for live in bench.told if live.text.startswith("fringe")]
     assert told[0].text == "fringe at 4 ms, 5 of 8"
     assert told[0].progress == 0.5
+
+
+def test_progress_of_several_bursts_is_that_of_all(bench: Bench) -> None:
+    def plan() -> Plan[None]:
+        for number in range(4):
+            burst = tuple(Shot(WHITE, 2.0, role=f"{number}/{n}") for n in range(3))
+            yield OneOf(burst, number, 4, "look")
+        yield (Shot(WHITE, 2.0), Shot(WHITE, 2.0))
+
+    with Shooter(bench.rig, bench.control) as shooter:
+        session = bench.session(shooter, bench.control)
+        session.clock = lambda: float(len(shots))
+        shots: list[str] = []
+        session.seen = lambda camera, frame, row: shots.append(camera) if camera == "left" else None
+        session.run_plan(plan())
+    told = [live for live in bench.told if " of " in live.text]
+    assert told[0].text == "look 1 of 4: 0/0 at 2 ms, 1 of 3"
+    assert told[11].text == "look 4 of 4: 3/2 at 2 ms, 3 of 3"
+    assert [live.progress for live in told] == pytest.approx([*(n / 12 for n in range(12)), 0, 0.5])
+    assert told[0].remaining_s is None
+    # A burst of its own is told as before.
+    assert told[12].text == "uniform at 2 ms, 1 of 2"
 
 
 # rendering

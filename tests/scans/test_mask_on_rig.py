@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from backend.domain.rig import RigCalibration
+from backend.domain.states import Level
 from backend.numerics.camera_model import project
 from backend.numerics.code_certainty import on_epipolar_line
 from backend.numerics.homography import map_points
@@ -187,8 +188,21 @@ def test_a_second_look_tells_what_second_reflections_had_spoilt():
         codes = edges(frames, mask, facts, EdgesParams(), silent)
         params = SecondLookParams(bands=6, band_px=6)
         look = second_look(codes, frames, mask, base, facts, calibration, params, shoot)
+        little = params.model_copy(update={"budget_s": 0.4 * look.whole_s})
+        less = second_look(codes, frames, mask, base, facts, calibration, little, shoot)
     found = Masked(shoot, base, mask)
-    assert look.looks == 6
+    assert (look.looks, look.left_out) == (6, 0)
+    assert look.whole_s > sum(f.exposure_ms for f in look.frames) / 1000
+    # There is time for two looks in five: those that most pixels wait for, and nothing is told elsewhere.
+    assert (less.looks, less.left_out) == (2, 4)
+    assert less.whole_s == pytest.approx(look.whole_s, rel=0.1)  # noise moves the exposure a little
+    assert 2 / 6 < less.trusted["left"].sum() / look.trusted["left"].sum() < 1
+    assert (less.trusted["left"] & ~look.trusted["left"]).mean() < 0.001
+    (verdict,) = second_look.checks
+    assert verdict(look, params).level is Level.OK
+    warning = verdict(less, little)
+    assert warning.level is Level.WARNING
+    assert "4 of 6 looks were left out" in warning.sentence
     # Most of what is looked at again had been dimmed: less time and more light instead, in whole projector frames.
     assert look.exposure_ms < 0.7 * base.exposure_ms
     frame_ms = facts.projector.frame_period_ms
