@@ -257,6 +257,39 @@ class Running(FakeFeatures):
         self.is_acquiring = self.is_acquiring and name != "AcquisitionStop"
 
 
+class Hiding(FakeFeatures):
+    """Has an exposure time and a gain only where nothing else sets them."""
+
+    def has(self, name: str) -> bool:
+        hidden = {
+            "ExposureTime": self.texts["ExposureMode"] != "Timed",
+            "Gain": self.texts["GainAuto"] != "Off",
+        }
+        return super().has(name) and not hidden.get(name, False)
+
+
+def test_what_an_automatic_hides_is_there_once_it_is_off():
+    features = Hiding(
+        {
+            **SIZE,
+            "ExposureTime": (70.0, 10, 1e6, 0, "us"),
+            "Gain": (0.0, 0, 20, 0, "dB"),
+        },
+        {
+            **FORMAT,
+            **TRIGGER,
+            "ExposureMode": ("TriggerWidth", ("Timed", "TriggerWidth")),
+            "GainAuto": ("Continuous", ("Off", "Continuous")),
+        },
+    )
+    made = SfncControls(
+        "left", features, SfncOptions(), buffered_frames=3, hardware_timestamp=False
+    )
+    made.prepare()
+    assert made.capabilities().exposure_us == Range(10, 1e6, 0, "us")
+    assert made.capabilities().gain_db == Range(0, 20, 0, "dB")
+
+
 def test_a_camera_that_still_runs_is_stopped_before_anything_is_set():
     features = Running(
         {**SIZE, **OLD_NAMES},

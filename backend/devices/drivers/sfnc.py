@@ -129,11 +129,17 @@ class SfncControls:
         self._options = options
         self._buffered_frames = buffered_frames
         self._hardware_timestamp = hardware_timestamp
-        self._exposure = self._first(_EXPOSURES)
-        self._gain = next((n for n in _GAINS if self._is_in_db(n)), "")
+        self._exposure = self._gain = self._raw_gain = ""
+        """Names of its features; known after `prepare`."""
         self.left_on = LeftOn((), ())
         """What a viewer left behind; known after `prepare`."""
-        self._raw_gain = "" if self._gain or not options.gain_db_per_step else self._first((_RAW_GAIN,))  # fmt: skip
+
+    def _find_names(self) -> None:
+        """See how it calls exposure and gain: some have neither as long as something else sets them."""
+        self._exposure = self._first(_EXPOSURES)
+        self._gain = next((n for n in _GAINS if self._is_in_db(n)), "")
+        known = self._gain or not self._options.gain_db_per_step
+        self._raw_gain = "" if known else self._first((_RAW_GAIN,))
 
     def _first(self, names: tuple[str, ...]) -> str:
         return next((name for name in names if self._features.has(name)), "")
@@ -156,6 +162,7 @@ class SfncControls:
         ):  # fmt: skip
             self._set_if_possible(name, value)
         self.left_on += overrule(self._camera, features)
+        self._find_names()
         self._choose_format()
         self._read_region()
         for selector in features.choices("TriggerSelector"):  # another one may hold frames back
