@@ -149,8 +149,8 @@ def _say_lost(before: "CalibrationEntry | None", now: "CalibrationEntry") -> Non
     for name in ("projector", "screen", "mirror"):
         if before is not None and getattr(before, name) and not getattr(now, name):
             console().print(
-                f"The {name} that was calibrated before isn't kept: its place was said by cameras that are calibrated anew."
-                " Name its file, too."
+                f"The {name} that was calibrated before isn't kept: its place was said by cameras that are calibrated anew;"
+                " name its file, too."
             )
 
 
