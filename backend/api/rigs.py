@@ -154,9 +154,9 @@ def check_rig(
         Body(description="What the rig's factory takes; none: the options that it has."),
     ] = None,
 ) -> RigState:
-    """Begin to check a rig: who its devices are, a white and a black frame of each camera, and what looks wrong.
+    """Begin to check a rig: a white and a black frame of each camera, and what looks wrong.
 
-    `work` of the rig's state tells how far it is and what was found.
+    `work` of the rig's state tells how far it is and what was found, `devices` who they are.
     """
     return services.rig_desk.start_check(rig, who.user, options)
 
