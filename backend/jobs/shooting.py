@@ -47,6 +47,9 @@ _RECONNECT_SLICE_S = 2.0
 STEADY_S = 0.5
 """After that any display shows what it was asked to."""
 
+_ON_GRID = 0.01
+"""Of an exposure may lie beside the grid of refresh periods: less changes a frame by less than any check tells."""
+
 T = TypeVar("T")
 
 
@@ -101,6 +104,18 @@ class Shooter:
         return (
             f"measure the latency of its display (`unglare rigs latency --rig {self._rig.name}`) or raise the projector's"
             " settle_ms"
+        )
+
+    def off_grid(self, camera: str, exposure_ms: float) -> str:
+        """Say that an exposure sees a part of a display's frame that is another one each time; empty: it doesn't."""
+        refresh_hz = self._rig.projector.capabilities.refresh_hz
+        if not refresh_hz or not is_off_grid(exposure_ms, 1000.0 / refresh_hz):
+            return ""
+        period_ms = 1000.0 / refresh_hz
+        return (
+            f"{exposure_ms:.4g} ms is no multiple of the projector's refresh period of {period_ms:.4g} ms, so each frame sees"
+            " another part of it; expose for whole periods ('Whole projector frames' of the stages, snap_exposures of the rig's"
+            " file) or correct the projector's refresh_hz"
         )
 
     def __enter__(self) -> "Shooter":
@@ -336,6 +351,12 @@ class Shooter:
 
     def _darken(self) -> None:
         self._rig.projector.blank()
+
+
+def is_off_grid(exposure_ms: float, period_ms: float) -> bool:
+    """Tell whether what an exposure sees of a period that it doesn't see whole is more than a hundredth of it."""
+    periods = exposure_ms / period_ms
+    return abs(periods - round(periods)) > _ON_GRID * periods
 
 
 def settings_of(exposure_ms: float, gain_db: float) -> CameraSettings:

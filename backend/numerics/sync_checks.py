@@ -26,6 +26,10 @@ _LEAST_SHARE = 0.02
 """A band with less than this share of the light isn't judged."""
 _LEAST_MODULATION = 1.5 / 255
 """Of full scale: darker fringes drown in rounding."""
+_ROUNDING = 1 / 12
+"""Variance of a rounded gray level in [gray^2]; where hardly any noise hides its steps, neighbours have it in common."""
+_UNSURE = 0.04
+"""What chance and rounding may make of the square of a share: a display that is one pattern late makes 0.06."""
 _SURE = 2e-3
 """What chance may add to the square of a share."""
 _HARMONICS = (2, 3)
@@ -161,7 +165,7 @@ def same(frames: Sequence[FrameSample]) -> Finding | None:
     first = frames[0].gray
     light = _Light.of(valid, first)
     deviations = np.stack([f.gray - first for f in frames[1:]])
-    found = _judged(deviations, light, (), (), tell_frame=True)
+    found = _judged(deviations, light, (), (), tell_frame=True, roundings=2)
     # Of uniform fields any other one is brighter or darker everywhere.
     return found and Finding(found.share, None if found.frame is None else found.frame + 1)
 
@@ -436,10 +440,13 @@ def _judged(
     before: Sequence[FrameSample | None],
     *,
     tell_frame: bool,
+    roundings: int = 1,
 ) -> Finding | None:
+    """Compare deviations with the light; each holds so many roundings, all of them of weight 1."""
     counts = _counts(light.valid)
     full = frames[0].full_scale_gray if frames else 255.0
-    if light.energy < (_LEAST_MODULATION * full) ** 2 / 2:
+    least = (_LEAST_MODULATION * full) ** 2 / 2
+    if light.energy < least:
         return None
     if counts[0] < _LEAST_VALID * light.valid.size:
         return None
@@ -449,9 +456,12 @@ def _judged(
     noise = max(squares / counts[0] - float(found[:, 0].mean()), 0.0)
     if noise / np.sqrt(counts[0]) > _SURE * light.energy:
         return None
-    # In a band chance counts for more.
-    found[:, 1:] -= 4 * noise / np.sqrt(np.maximum(counts[1:], 1))
-    known = np.where(light.energies > 0, light.energies, np.inf)
+    # What is left of a scene that is over-exposed is dim: there chance and rounding look like a picture.
+    unsure = 4 * noise / np.sqrt(np.maximum(counts, 1)) + roundings * _ROUNDING
+    if unsure[0] > _UNSURE * light.energy:
+        return None
+    found -= unsure
+    known = np.where(light.energies >= least, light.energies, np.inf)
     shares = np.sqrt(np.maximum(found, 0.0) / known)
     worst, band = (int(i) for i in np.unravel_index(np.argmax(shares), shares.shape))
     share = float(shares[worst, band])

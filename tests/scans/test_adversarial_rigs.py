@@ -43,6 +43,9 @@ DISPLAY = "the display is late, torn or not lit"
 STILL = "white isn't brighter than black any more"
 LIGHT = "the light changes from frame to frame"
 CAMERA = "the other cameras saw what was shown at the same time"
+GRID = (
+    r"5 ms is no multiple of the projector's refresh period of 8\.333 ms.*expose for whole periods"
+)
 NAMED = r"(frame \d+ of \d+ \(.*\)|the (white|black) (marker|field)|the marker)"
 
 
@@ -85,6 +88,7 @@ REFUSED = [
     Case("frames from before the trigger", CAMERA, camera=stale, cameras=("right",)),
     Case("cap on a lens in mid-scan", f"{CAMERA}|{STILL}", camera=covered(9), cameras=("right",)),
     Case("cap on both", STILL, camera=covered(9)),
+    Case("exposed for a part of a frame", f"{GRID}.*{DISPLAY}", shots=burst(fringes(8), 0.6)),
 ]
 
 
@@ -102,6 +106,8 @@ def test_what_spoils_a_scan_is_refused_with_the_frame_and_the_reason(
     assert "\n" not in sentence
     if LIGHT not in case.words:
         assert LIGHT not in sentence
+    if GRID not in case.words:
+        assert "refresh period" not in sentence
 
 
 def shift_ids(frames: Sequence[Frame], count: int) -> Frame:

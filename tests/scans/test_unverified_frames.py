@@ -11,7 +11,7 @@ import pytest
 
 from backend.devices.errors import DeviceTimeout
 from backend.devices.protocols import Frame
-from backend.domain.errors import RigFailedError
+from backend.domain.errors import RigFailedError, StorageFullError
 from backend.domain.patterns import WHITE, Uniform
 from backend.domain.shots import Exposed, Plan, Shot, Until
 from backend.jobs import evidence, shooting
@@ -86,6 +86,44 @@ def test_a_set_that_is_never_right_is_kept_beside_the_frames(store: LocalArtifac
         bench.rig.projector.asked.clear()
         drive(bench, one_burst(shots))
         assert len(bench.rig.projector.asked) >= len(numbers)
+
+
+@pytest.mark.parametrize(
+    "hindrance", [StorageFullError("the disk is full"), OSError("input/output error")], ids=type
+)
+def test_evidence_that_cant_be_kept_hides_no_reason(
+    hindrance: Exception, store: LocalArtifactStore
+) -> None:
+    def keep(reason: str, frames: Sequence[Mapping[str, Any]]) -> bool:
+        raise hindrance
+
+    with bench_of(store, late(1)) as bench, pytest.raises(RigFailedError) as caught:
+        drive(bench, one_burst(FRINGES), keep)
+    assert "the display" in caught.value.sentence
+    assert "count for nothing" not in caught.value.sentence
+
+
+def test_a_camera_that_gives_up_when_a_set_is_taken_again_loses_no_frame(
+    store: LocalArtifactStore,
+) -> None:
+    told: list[tuple[str, Sequence[Mapping[str, Any]]]] = []
+
+    def gives_up(frames: Sequence[Frame], count: int) -> Frame:
+        if count > 2 * len(FRINGES):
+            raise DeviceTimeout("left", "no frame came")
+        return frames[-1]
+
+    def keep(reason: str, frames: Sequence[Mapping[str, Any]]) -> bool:
+        told.append((reason, frames))
+        return True
+
+    with bench_of(store, always_from(7, late(1))) as bench:
+        bench.rig.spoil(gives_up, "left")
+        with pytest.raises(RigFailedError, match=r"no frame came; .* that count for nothing"):
+            drive(bench, one_burst(FRINGES), keep)
+    ((reason, frames),) = told
+    assert "no frame came" in reason
+    assert {4, 5, 6, 7} <= {frame["number"] for frame in frames}
 
 
 def exposures(count: int, size_px: int = 10) -> tuple[list[Planned], list[dict[str, Frame]]]:

@@ -71,6 +71,39 @@ def test_noise_and_a_bent_response_are_no_deviation(steps: int, noise: float, ga
     assert found is None or found.share < 0.03
 
 
+def dim(light: np.ndarray, amplitude_gray: float, noise: float, seed: int) -> np.ndarray:
+    """Return what is seen of a smooth surface that hardly any light reaches."""
+    gray = 3.3 + (0.6 + 0.4 * X / SHAPE[1]) * amplitude_gray * light
+    noisy = gray + np.random.default_rng(seed).normal(0, noise, SHAPE)
+    return np.asarray(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize("amplitude_gray", [3.2, 5.0, 8.0])
+@pytest.mark.parametrize("noise", [0.05, 0.2, 0.5, 1.0])
+def test_rounding_is_no_deviation(noise: float, amplitude_gray: float) -> None:
+    """Where noise doesn't hide its steps, neighbours are rounded alike: it looks like a picture."""
+    for seed in range(4):
+
+        def step(k: int, steps: int, periods: float = 3.0, *, seed: int = seed) -> np.ndarray:
+            light = fringe(k + seed / 10, steps, periods=periods)
+            return dim(light, amplitude_gray, noise, 100 * seed + 10 * int(periods) + k)
+
+        found = [step_set(samples([step(k, n) for k in range(n)]), shifts(n)) for n in (4, 5, 8)]
+        parts = [common_part(samples([step(k, 3, p) for k in range(3)]), shifts(3)) for p in (2, 3)]
+        assert parts[0] is not None
+        assert parts[1] is not None
+        found.append(parts[1].against(parts[0]))
+        assert max((f.share for f in found if f), default=0.0) < 0.03
+
+
+def test_a_late_frame_stands_out_as_soon_as_there_is_light_enough_to_tell() -> None:
+    for amplitude_gray in (2.0, 4.0, 6.0, 8.0, 16.0):
+        grays = [dim(fringe(k, 4), amplitude_gray, 0.3, k) for k in range(4)]
+        found = step_set(samples([*grays[:2], grays[1], grays[3]]), shifts(4))
+        assert found is None or found.share > 0.1
+        assert found is not None or amplitude_gray < 6
+
+
 @pytest.mark.parametrize("wrong", [late, torn, swapped])
 @pytest.mark.parametrize("steps", [4, 5, 8, 12])
 def test_a_wrong_frame_stands_out(steps: int, wrong: object) -> None:
