@@ -249,12 +249,15 @@ class SyncWatch:
 
 _DEVIATION, _MARKER, _UNTOLD = "sync_deviation", "sync_marker", "sync_untold"
 """What a frame's metadata say of its set, of the marker beside it, and whether only that tells of it."""
+_LIT = "sync_lit"
+"""Whether a white marker was lit beside it."""
 
 
 def _written(found: Findings) -> dict[str, object]:
     return {
         **({_DEVIATION: found.deviation} if found.sets else {}),
         **({_MARKER: found.marker} if found.markers else {}),
+        **({_LIT: True} if found.lit else {}),
         _UNTOLD: found.untold > 0,
     }
 
@@ -266,6 +269,7 @@ def _read(told: Mapping[str, object]) -> Findings:
         deviation=deviation if isinstance(deviation, float) else 0.0,
         markers=int(isinstance(marker, float)),
         marker=marker if isinstance(marker, float) else 0.0,
+        lit=int(told.get(_LIT) is True),
         frames=int(untold is not None),
         untold=int(untold is True),
     )
@@ -287,7 +291,7 @@ def _why_unseen(fields: Fields) -> str:
 def _synchronisation(found: Findings) -> Check:
     again = f"; {found.again} times frames were wrong and taken again" if found.again else ""
     unseen = "".join(f"; camera {name} {why}" for name, why in found.unseen.items())
-    if not found.sets and not found.markers:
+    if not found.sets and not found.markers and not found.lit:
         sentence = (
             "the cameras see too little of the projector's light to tell whether frames are late"
         )
@@ -299,6 +303,8 @@ def _synchronisation(found: Findings) -> Check:
         parts.append(f"sets deviate by {found.deviation:.1%} at most")
     if found.markers:
         parts.append(f"markers are dark ({found.marker:.1%} of the light)")
+    if found.lit:
+        parts.append("white markers are lit")
     if found.untold:
         parts.append(f"of {found.untold} frames only markers tell")
     sentence = f"frames show what they were taken for: {', '.join(parts)}{unseen}{again}"

@@ -127,6 +127,8 @@ class Findings:
     deviation: float = 0.0
     markers: int = 0
     marker: float = 0.0
+    lit: int = 0
+    """White markers among frames that are dark themselves."""
     frames: int = 0
     untold: int = 0
     """Frames of the plan that only markers tell of."""
@@ -145,6 +147,7 @@ class Findings:
         """Take in what was found of a unit that is right."""
         self.sets += found.sets
         self.markers += found.markers
+        self.lit += found.lit
         self.frames += found.frames
         self.untold += found.untold
         self.deviation = max(self.deviation, found.deviation)
@@ -258,6 +261,7 @@ class Look:
                     return self._violation(
                         f"the white marker {self._place(n)} has only {share:.0%} of the light"
                     )
+                self._found.lit += share is not None
                 continue
             others = [
                 self._samples[i]

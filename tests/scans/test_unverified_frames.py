@@ -12,7 +12,7 @@ import pytest
 from backend.devices.errors import DeviceTimeout
 from backend.devices.protocols import Frame
 from backend.domain.errors import RigFailedError, StorageFullError
-from backend.domain.patterns import WHITE, Uniform
+from backend.domain.patterns import BLACK, WHITE, Uniform
 from backend.domain.shots import Exposed, Plan, Shot, Until
 from backend.jobs import evidence, shooting
 from backend.jobs.capture import CaptureSession
@@ -194,6 +194,20 @@ def test_what_was_found_of_frames_is_known_whenever_they_are_answered_from_the_j
     assert now.name == then.name
     assert now.value == then.value
     assert "frames show what they were taken for: sets deviate" in now.sentence
+
+
+def test_dark_frames_are_told_by_a_white_marker_also_from_the_journal(
+    store: LocalArtifactStore,
+) -> None:
+    """Nothing is wrong with the light: it mustn't be said that there is too little of it."""
+    dark_only = burst([BLACK])
+    with bench_of(store) as bench:
+        drive(bench, one_burst(dark_only))
+        replay = session_of(bench, None)
+        replay.run_plan(one_burst(dark_only))
+        for check in (bench.verdict, *replay.finish()):
+            assert "white markers are lit" in check.sentence
+            assert "too little" not in check.sentence
 
 
 def test_a_resume_tells_of_all_frames(store: LocalArtifactStore) -> None:
