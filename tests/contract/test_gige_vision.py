@@ -209,6 +209,17 @@ def test_pictures_that_stop_coming_are_no_matter_of_a_trigger_line(addresses):
             camera.get_frame(timeout_s=0.5)
 
 
+def test_a_camera_that_goes_away_before_its_picture_comes_is_no_defect(addresses):
+    with network(addresses, Wire(largest_bytes=0)) as (_, peers), opened(addresses) as camera:
+        camera.arm()
+        camera.trigger()
+        peers[0].stop()
+        with pytest.raises(DeviceDisconnected, match="left: doesn't answer"):
+            camera.get_frame(timeout_s=0.3)
+        assert camera.state is LinkState.LOST
+        peers[0].start()  # giving it back is quicker if somebody answers
+
+
 def test_a_region_that_a_camera_refuses_is_named_with_the_way_out(addresses):
     with network(addresses):
         with opened(addresses, region=[0, 0, 160, 120]) as camera:  # as it is: nothing to write

@@ -230,8 +230,11 @@ class AravisCamera(SfncCamera):
             TriggerSource.FREE_RUN,
         )
         fired = self._due_at_s > 0 or self._settings.trigger is TriggerSource.FREE_RUN
-        trouble = "" if waits_for_line or not fired else self._stream_trouble()
-        return trouble or super()._cure
+        if waits_for_line or not fired:
+            return super()._cure
+        # A camera that is gone says so here; one that is aborted meanwhile has no stream any more.
+        with self._calling, self._doing("asking why no picture comes"):
+            return self._stream_trouble() or super()._cure
 
     def _stream_trouble(self) -> str:
         """Say what is known of a stream that brings no picture; empty: nothing, or it isn't on a network."""
