@@ -278,7 +278,7 @@ class CaptureSession:
             if len(violations) == 1:
                 first = unit, frames
             if len(violations) == TRIES:
-                error = self._out_of_sync(violations, [p.shot for p in first[0].planned], burst)
+                error = self._out_of_sync(violations, first[0].planned)
                 self._keep_evidence(error, first[0].planned, first[1], violations[0].number)
                 raise error
             self.control.note(f"{violation.camera}: {violation.sentence}; taken again")
@@ -328,15 +328,14 @@ class CaptureSession:
             self._watch.recall(row.metadata)
 
     def _out_of_sync(
-        self, violations: Sequence[Violation], shots: Sequence[Shot], burst: Sequence[Shot]
+        self, violations: Sequence[Violation], planned: Sequence[Planned]
     ) -> OutOfSync:
-        """Say which frame was wrong first, and what is to blame; `shots` are those that were looked at with it."""
+        """Say which frame was wrong first, and what is to blame; `planned` is what was looked at with it."""
         assert self.shooter is not None  # `_load` refused otherwise
         first = violations[0]
         cause = self._watch.blame(violations)
-        if first.number is not None:
-            shots = [burst[first.number]]
-        off_grid = (self.shooter.off_grid(first.camera, s.exposure_ms) for s in shots)
+        looked_at = [p for p in planned if first.number in (None, p.number)]
+        off_grid = (self.shooter.off_grid(p.cameras, p.shot.exposure_ms) for p in looked_at)
         grid = "" if cause is Cause.STILL else next(filter(None, off_grid), "")
         reason = {
             Cause.DISPLAY: f"{_DISPLAY}; {self.shooter.way_out}",
@@ -489,7 +488,7 @@ class CaptureSession:
                     return {share.camera: row for share, row in zip(shares, rows, strict=True)}
                 violations.append(violation)
                 if len(violations) == TRIES:
-                    error = self._out_of_sync(violations, burst, burst)
+                    error = self._out_of_sync(violations, unit.planned)
                     self._keep_evidence(error, unit.planned, shown)
                     raise error
                 self.control.note(f"{violation.camera}: {violation.sentence}; taken again")

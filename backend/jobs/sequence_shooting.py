@@ -58,9 +58,10 @@ class SequenceShooter(Shooter):
         """What helps if frames don't show what they were taken for."""
         return "check the trigger lines, their delay and the sequence that the projector holds"
 
-    def off_grid(self, camera: str, exposure_ms: float) -> str:
-        """Say nothing of cameras that are wired: a pattern is complete within their exposure, whatever that is."""
-        return "" if camera in self._lines else super().off_grid(camera, exposure_ms)
+    def off_grid(self, cameras: Sequence[str], exposure_ms: float) -> str:
+        """Say nothing where all cameras are wired: a pattern is complete within their exposure, whatever that is."""
+        wired = set(cameras) <= set(self._lines)
+        return "" if wired else super().off_grid(cameras, exposure_ms)
 
     def chunks(self, takes: Sequence[Take]) -> Iterator[Sequence[Take]]:
         """Cut exposures into sequences."""

@@ -106,7 +106,7 @@ class Shooter:
             " settle_ms"
         )
 
-    def off_grid(self, camera: str, exposure_ms: float) -> str:
+    def off_grid(self, cameras: Sequence[str], exposure_ms: float) -> str:
         """Say that an exposure sees a part of a display's frame that is another one each time; empty: it doesn't."""
         refresh_hz = self._rig.projector.capabilities.refresh_hz
         if not refresh_hz or not is_off_grid(exposure_ms, 1000.0 / refresh_hz):

@@ -13,6 +13,7 @@ from backend.domain.errors import RigFailedError
 from backend.domain.patterns import Uniform
 from backend.domain.shots import Exposed, Shot
 from backend.domain.states import Level
+from backend.jobs.shooting import is_off_grid
 from backend.storage.artifacts import LocalArtifactStore
 from tests.scans.doubtful import (
     CameraFault,
@@ -109,6 +110,16 @@ def test_what_spoils_a_scan_is_refused_with_the_frame_and_the_reason(
         assert LIGHT not in sentence
     if GRID not in case.words:
         assert "refresh period" not in sentence
+
+
+@pytest.mark.parametrize(
+    ("exposure_ms", "off"),
+    [(1.0, True), (10.0, True), (25.0, True), (16.683, False), (50.0, False), (66.7, False), (1001.0, False)],
+)  # fmt: skip
+def test_an_exposure_is_off_the_grid_if_it_sees_much_of_a_frame_that_it_doesnt_see_whole(
+    exposure_ms: float, off: bool
+) -> None:
+    assert is_off_grid(exposure_ms, 1000 / 60) is off
 
 
 def shift_ids(frames: Sequence[Frame], count: int) -> Frame:

@@ -262,6 +262,13 @@ def test_chunks_of_a_wired_rig() -> None:
         assert [len(chunk) for chunk in shooter.chunks(takes)] == [4, 2, 1, 1]
 
 
+def test_only_cameras_that_arent_wired_have_a_grid_of_exposures() -> None:
+    with WiredRig({"left": TriggerSource.LINE1}) as rig:
+        shooter = shooter_of(rig, JobControl())
+        assert shooter.off_grid(("left",), 10.0) == ""
+        assert "10 ms is no multiple" in shooter.off_grid(("left", "right"), 10.0)
+
+
 def test_uniform_fields_come_in_their_order(store: LocalArtifactStore) -> None:
     with WiredRig() as rig:
         exposed, _ = captured(
