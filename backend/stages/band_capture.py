@@ -14,7 +14,7 @@ from backend.domain.hints import Frames, Value
 from backend.domain.params import Params, setting
 from backend.domain.patterns import Pattern
 from backend.domain.rig import RigCalibration, RigFacts
-from backend.domain.shots import Plan, Shoot, Shot
+from backend.domain.shots import OneOf, Plan, Shoot, Shot
 from backend.domain.stage import stage
 from backend.domain.states import Level, Review
 from backend.numerics.epipolar_bands import Bands, EpipolarLines, bands_around, epipolar_lines
@@ -197,6 +197,7 @@ def capture_plan(
     """Take a burst for every camera, bit and half of the bands."""
     frames: list[Frame] = []
     sets: list[BandSet] = []
+    count = sum(2 * bands.bits for bands in masks.bands.values())
     for camera, bands in masks.bands.items():
         for bit in range(bands.bits):
             for is_inverse in (False, True):
@@ -206,7 +207,7 @@ def capture_plan(
                     for t in exposures_ms
                     for p in patterns
                 )
-                exposed = yield burst
+                exposed = yield OneOf(burst, len(sets), count, "bands")
                 sets.append(BandSet(camera, bit, is_inverse, len(frames), len(burst)))
                 frames += [shot[camera] for shot in exposed]
     return BandFrames(

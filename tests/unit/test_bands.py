@@ -127,8 +127,8 @@ class TwoPaths:
         request = next(plan)
         try:
             while True:
-                self.shots += request
-                request = plan.send(tuple(self.take(shot) for shot in request))
+                self.shots += request.burst
+                request = plan.send(tuple(self.take(shot) for shot in request.burst))
         except StopIteration as end:
             return end.value
 
