@@ -103,6 +103,8 @@ class SecondLook:
 
 
 def _told(result: SecondLook, params: SecondLookParams) -> Check:
+    if np.isnan(result.before_share):
+        return Check("told", Level.OK, "nobody looked which pixels are lit from two places")
     sentence = f"{result.before_share:.2%} of the lit pixels are untold or lit from two places"
     if result.codes is not None:
         sentence += f", {result.after_share:.2%} after a second look"

@@ -226,5 +226,11 @@ def test_no_second_look_is_taken_where_nobody_asked_for_a_mask():
         codes = edges(frames, None, facts, EdgesParams(), silent)
         look = second_look(codes, frames, None, base, facts, calibration, SecondLookParams(), shoot)
     assert look.codes is None
+    (verdict,) = second_look.checks
+    assert (verdict(look, SecondLookParams()).level, verdict(look, SecondLookParams()).value) == (
+        Level.OK,
+        None,
+    )
+    assert "nan" not in verdict(look, SecondLookParams()).sentence
     assert joined_codes(codes, look) is codes
     assert joined_codes(codes, None) is codes
