@@ -9,12 +9,14 @@ import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from urllib.parse import quote, urlencode
 
 from backend.domain.errors import NotFoundError, StartupError
 
 _CLOSING_S = 10.0
+_LONGEST_QUOTED = 80
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _FLAGS = (
     "--kiosk", "--force-device-scale-factor=1", "--force-color-profile=srgb",  # no pixel is scaled or converted
@@ -116,6 +118,7 @@ class Kiosk:
         try:
             yield browser
         finally:
+            self._door_of(name).unlink(missing_ok=True)  # the token stands in it
             browser.terminate()
             try:
                 browser.wait(timeout=_CLOSING_S)
@@ -125,16 +128,17 @@ class Kiosk:
 
     def profile(self, name: str) -> Path:
         """Return the folder that the browser keeps for a projector: a browser opens everything of one profile."""
-        return self._folder / f"profile-{quote(name, safe='')}"
+        return self._folder / f"profile-{_file_name(name)}"
+
+    def _door_of(self, name: str) -> Path:
+        return self._folder / f"open-{_file_name(name)}.html"
 
     def _close_left_over(self, name: str) -> None:
         profile = self.profile(name)
         try:
             pid = int((profile / "SingletonLock").readlink().name.rpartition("-")[2])  # HOST-PID
-            if (
-                os.fsencode(f"--user-data-dir={profile}")
-                not in Path(f"/proc/{pid}/cmdline").read_bytes()
-            ):
+            arguments = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            if os.fsencode(f"--user-data-dir={profile}") not in arguments:
                 return  # another program has that number by now
             browser = os.pidfd_open(pid)
         except (OSError, ValueError, AttributeError):  # nothing is left, or this isn't Linux
@@ -174,7 +178,19 @@ class Kiosk:
         """Write the page that leads on: a token among a program's arguments could be read by everybody."""
         query = {"name": name} | ({"token": token} if token else {})
         target = html.escape(f"{address}/projector?{urlencode(query)}")
-        door = self._folder / f"open-{quote(name, safe='')}.html"
+        door = self._door_of(name)
         door.touch(mode=0o600)
         door.write_text(f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">\n')
         return door
+
+
+def _file_name(name: str) -> str:
+    """Return a file name for a projector's name, whatever characters that has; a long one by its hash.
+
+    Examples
+    --------
+    >>> _file_name("left wall/2")
+    'left%20wall%2F2'
+    """
+    quoted = quote(name, safe="")
+    return quoted if len(quoted) <= _LONGEST_QUOTED else sha256(quoted.encode()).hexdigest()

@@ -66,6 +66,7 @@ def test_the_window_is_closed_behind_the_command(
         os.kill(pid, 0)  # it is there
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+    assert not list((tmp_path / "kiosk").glob("*.html"))  # the token stood there
 
 
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="only Linux tells whose profile it is")
@@ -94,3 +95,13 @@ def test_without_a_browser_the_way_out_is_said(
     monkeypatch.setattr("backend.services.kiosk.shutil.which", lambda name: None)
     with pytest.raises(StartupError, match="apt-get install chromium"):
         Kiosk(tmp_path).command(DESK, "http://127.0.0.1:8000", name="projector", token=None)
+
+
+def test_projectors_of_any_name_have_profiles_of_their_own(tmp_path: Path) -> None:
+    kiosk = Kiosk(tmp_path)
+    names = ["left", "../left", "left/", "Бильярдная" * 10, "Бильярдная" * 11]
+    profiles = [kiosk.profile(name) for name in names]
+    assert len(set(profiles)) == len(names)
+    for profile in profiles:
+        profile.mkdir()
+        assert profile.parent == tmp_path
