@@ -1,7 +1,7 @@
 """`unglare import`, `export` and `replay`: captures that come, go, and are done again."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +19,7 @@ from backend.cli.scanning import (
     Out,
     WithFrames,
     describe_scan,
+    edit_settings,
     refuse_place,
     run_and_export,
     show_summary,
@@ -26,7 +27,6 @@ from backend.cli.scanning import (
 
 if TYPE_CHECKING:
     from backend.services.replaying import Replay
-    from backend.services.services import Services
 
 _Scan = Annotated[str, typer.Argument(metavar="SCAN", help="Id of the scan.")]
 
@@ -68,16 +68,6 @@ def import_capture(
             progress.finish()
     if not as_json:
         show_summary(answer)
-
-
-def edit_settings(services: "Services", scan: str, changes: dict[str, dict[str, Any]]) -> None:
-    """Edit the imported scan's settings: an import has no recipe of its own."""
-    from backend.contract.requests import EditSettings
-
-    for stage, values in changes.items():
-        revision = services.scan(scan).revision
-        request = EditSettings(changes=values, reason="command line", revision=revision)
-        services.edit(scan, stage, request, who())
 
 
 def export_scan(

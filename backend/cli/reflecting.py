@@ -6,11 +6,16 @@ from typing import Annotated, Any
 
 import typer
 
-from backend.cli.captures import edit_settings
 from backend.cli.house import open_services, who
 from backend.cli.options import AsJson, DataFolder, Quiet, Settings, parse_settings, with_uploads
 from backend.cli.output import Document, ProgressLines, answering, console, quiet_logging, table
-from backend.cli.scanning import WithFrames, describe_scan, refuse_place, run_and_export
+from backend.cli.scanning import (
+    WithFrames,
+    describe_scan,
+    edit_settings,
+    refuse_place,
+    run_and_export,
+)
 
 SUMMARY = "summary.json"
 _PROCESSING = ("screen_phase", "slopes", "surface", "mirror_cloud")

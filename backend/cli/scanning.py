@@ -102,12 +102,26 @@ def scan(
         with open_services(data, progress, rig=rig, monitor=monitor) as services:
             refuse_place(services, out)
             progress.step("rig", 0.0, "opening")
+            if resume:
+                method = services.scan(resume).method
             uploaded = with_uploads(services, method, request.settings)
+            if resume:
+                edit_settings(services, resume, uploaded)
             request = request.model_copy(update={"settings": uploaded})
             chosen = resume or services.create_scan(request, who()).id
             run_and_export(services, chosen, answer, progress, out=out, frames=frames)
     if not as_json:
         show_summary(answer)
+
+
+def edit_settings(services: "Services", scan: str, changes: dict[str, dict[str, Any]]) -> None:
+    """Edit the settings of a scan that is there already: an imported or a resumed one."""
+    from backend.contract.requests import EditSettings
+
+    for stage, values in changes.items():
+        revision = services.scan(scan).revision
+        request = EditSettings(changes=values, reason="command line", revision=revision)
+        services.edit(scan, stage, request, who())
 
 
 def _revived(scan_id: str, data: Path | None) -> str:

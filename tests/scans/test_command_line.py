@@ -217,7 +217,7 @@ def test_a_failed_check_stops_an_unattended_scan(unglare):
     assert done.answer["error"].count("\n") == 0
 
 
-def test_ctrl_c_cancels_and_keeps_the_scan(unglare, monkeypatch):
+def test_ctrl_c_cancels_and_keeps_the_scan(unglare, monkeypatch, tmp_path):
     wait, presses = JobThreads.wait, iter([True])
 
     def press_once(self: JobThreads, job: str, timeout_s: float | None = None) -> bool:
@@ -230,9 +230,14 @@ def test_ctrl_c_cancels_and_keeps_the_scan(unglare, monkeypatch):
     assert done.status == 130
     assert done.answer["status"] == "cancelled"
     assert "kept" in done.answer["error"]
-    again = unglare("scan", "--resume", done.answer["scan"], "--json", "--quiet")
+    # What it goes on with may be set: an operator who was tired of waiting wants less.
+    scan = done.answer["scan"]
+    again = unglare("scan", "--resume", scan, "--set", "exposures.steps=5", "--json", "--quiet")
     assert again.status == 0, again.err
     assert again.answer["status"] == "finished"
+    with real_house(tmp_path / "data") as services:
+        stages = {stage.name: stage for stage in services.scan(scan).stages}
+    assert stages["exposures"].settings["steps"].value == 5
 
 
 def test_a_scan_whose_process_was_killed_goes_on(unglare, tmp_path):
