@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64
-from scipy.interpolate import PchipInterpolator
 
 from backend.numerics.errors import ResponseError
 
@@ -102,6 +101,9 @@ def control_of_gray(ramp: MonotoneRamp, levels: int) -> Float64[np.ndarray, "lev
 
     Monotone cubic (PCHIP) through the measured points: it doesn't overshoot, so the inverse is one-to-one.
     """
+    # scipy.interpolate costs 0.4 s to import: only screens pay.
+    from scipy.interpolate import PchipInterpolator
+
     inverse = PchipInterpolator(ramp.gray, ramp.control, extrapolate=False)
     return np.asarray(inverse(np.arange(levels, dtype=np.float64)), np.float64)
 
@@ -112,5 +114,7 @@ def gray_of_control(
     wanted: Float[np.ndarray, "*shape"],
 ) -> Float64[np.ndarray, "*shape"]:
     """Look control values up in a measured ramp, clipped ends included; beyond its ends stays what they have."""
+    from scipy.interpolate import PchipInterpolator
+
     forward = PchipInterpolator(control, np.maximum.accumulate(gray))
     return np.asarray(forward(np.clip(wanted, control[0], control[-1])), np.float64)

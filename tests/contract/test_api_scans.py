@@ -208,7 +208,8 @@ def test_several_findings_are_counted_and_listed(client: httpx.Client) -> None:
         ("GET", "/api/artifacts/..%2F..%2Fetc%2Fpasswd", 404, "not-found"),
         ("GET", "/api/artifacts/ABCDEF0123456789", 422, "invalid-request"),
         ("GET", f"/api/artifacts/{'0' * 64}", 404, "not-found"),
-        ("GET", "/api/rigs/never opened/cameras/left/preview", 204, ""),
+        ("GET", "/api/rigs/toy/cameras/left/preview", 204, ""),
+        ("GET", "/api/rigs/unknown/cameras/left/preview", 404, "not-found"),
     ],
 )
 def test_what_isnt_there_or_cant_be_asked(

@@ -27,7 +27,7 @@ from backend.storage.database import utc_now
 from backend.storage.rows import JobRow
 from tests.scans.toy import Faults, ToyRig
 
-HEAVY = {"open3d", "viser", "pytest", "matplotlib", "plotly"}
+HEAVY = {"open3d", "viser", "pytest", "matplotlib", "plotly", "scipy.interpolate", "scipy.optimize", "scipy.spatial"}  # fmt: skip
 
 
 def environment(folder: Path, **settings: str) -> dict[str, str]:
@@ -209,7 +209,7 @@ def test_without_any_token_there_is_no_application(tmp_path: Path) -> None:
 
 
 def test_importing_the_application_takes_nothing_heavy_along() -> None:
-    code = "import sys, backend.main; print(*sorted({m.partition('.')[0] for m in sys.modules}))"
+    code = "import sys, backend.main; print(*sys.modules)"
 
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
