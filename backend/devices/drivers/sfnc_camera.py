@@ -1,7 +1,8 @@
 """What all cameras have in common whose library reads their GenICam description."""
 
 from backend.devices.drivers.library_camera import LibraryCamera
-from backend.devices.drivers.sfnc import Features, SfncControls, SfncOptions
+from backend.devices.drivers.sfnc import SfncControls, SfncOptions
+from backend.devices.drivers.sfnc_features import Features
 from backend.devices.protocols import CameraSettings, DeviceInfo, TriggerSource
 
 _FREE_RUN_BUFFERS = 3

@@ -7,51 +7,9 @@ refused.
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
+from backend.devices.drivers.sfnc_features import Features
 from backend.devices.errors import FeatureError
-
-
-@runtime_checkable
-class Overruled(Protocol):
-    """What is needed of a camera's `Features` here."""
-
-    def has(self, name: str) -> bool:
-        """Tell whether the camera has a feature now."""
-        ...
-
-    def choices(self, name: str) -> tuple[str, ...]:
-        """Return what an enumeration can be set to."""
-        ...
-
-    def text(self, name: str) -> str:
-        """Return a feature as text."""
-        ...
-
-    def number(self, name: str) -> float:
-        """Return a number."""
-        ...
-
-    def flag(self, name: str) -> bool:
-        """Tell whether something is on."""
-        ...
-
-    def bounds(self, name: str) -> tuple[float, float, float]:
-        """Return smallest, largest and step (0: any) of a number."""
-        ...
-
-    def set_text(self, name: str, value: str) -> None:
-        """Set an enumeration."""
-        ...
-
-    def set_number(self, name: str, value: float) -> None:
-        """Set a number."""
-        ...
-
-    def set_flag(self, name: str, *, value: bool) -> None:
-        """Switch something on or off."""
-        ...
-
 
 Value = str | float | bool
 
@@ -114,7 +72,7 @@ class LeftOn:
         return LeftOn(self.corrected + more.corrected, self.remaining + more.remaining)
 
 
-def overrule_sequencer(camera: str, features: Overruled) -> LeftOn:
+def overrule_sequencer(camera: str, features: Features) -> LeftOn:
     """Do so with the sequencer, before anything else is set: while it runs it locks what it sets, automatics included.
 
     Raises
@@ -125,7 +83,7 @@ def overrule_sequencer(camera: str, features: Overruled) -> LeftOn:
     return _overruled(camera, features, _SEQUENCER)
 
 
-def overrule(camera: str, features: Overruled) -> LeftOn:
+def overrule(camera: str, features: Features) -> LeftOn:
     """Set what a scan needs otherwise than it is.
 
     Raises
@@ -136,12 +94,12 @@ def overrule(camera: str, features: Overruled) -> LeftOn:
     return _overruled(camera, features, (*_RULES, *_TONE_CURVES))
 
 
-def overrule_trigger(camera: str, features: Overruled) -> LeftOn:
+def overrule_trigger(camera: str, features: Features) -> LeftOn:
     """Do the same with the trigger that is selected."""
     return _overruled(camera, features, _OF_A_TRIGGER)
 
 
-def _overruled(camera: str, features: Overruled, rules: tuple[_Rule, ...]) -> LeftOn:
+def _overruled(camera: str, features: Features, rules: tuple[_Rule, ...]) -> LeftOn:
     corrected: list[str] = []
     remaining: list[str] = []
     for rule in (_reachable(features, rule) for rule in rules):
@@ -170,7 +128,7 @@ def _overruled(camera: str, features: Overruled, rules: tuple[_Rule, ...]) -> Le
     return LeftOn(tuple(corrected), tuple(remaining))
 
 
-def _reachable(features: Overruled, rule: _Rule) -> _Rule:
+def _reachable(features: Features, rule: _Rule) -> _Rule:
     """Return a rule as far as the camera can follow it, where that is enough."""
     if not (rule.or_nearest and isinstance(rule.value, float) and features.has(rule.feature)):
         return rule
@@ -178,7 +136,7 @@ def _reachable(features: Overruled, rule: _Rule) -> _Rule:
     return replace(rule, value=min(max(rule.value, low), high))
 
 
-def _found(features: Overruled, rule: _Rule) -> Value | None:
+def _found(features: Features, rule: _Rule) -> Value | None:
     """Return how a feature is; None where the camera hasn't it, or it can be nothing else."""
     if not features.has(rule.feature):
         return None
@@ -189,7 +147,7 @@ def _found(features: Overruled, rule: _Rule) -> Value | None:
     return _read(features, rule)
 
 
-def _read(features: Overruled, rule: _Rule) -> Value:
+def _read(features: Features, rule: _Rule) -> Value:
     if isinstance(rule.value, bool):
         return features.flag(rule.feature)
     if isinstance(rule.value, str):
@@ -197,7 +155,7 @@ def _read(features: Overruled, rule: _Rule) -> Value:
     return features.number(rule.feature)
 
 
-def _set(features: Overruled, rule: _Rule) -> tuple[Value, str]:
+def _set(features: Features, rule: _Rule) -> tuple[Value, str]:
     """Set a feature; return what is read back, and why it is refused."""
     why = ""
     try:
@@ -230,7 +188,7 @@ _WORTH_TELLING = (
 )  # fmt: skip
 
 
-def told(camera: str, features: Overruled) -> tuple[str, ...]:
+def told(camera: str, features: Features) -> tuple[str, ...]:
     """Say what its owner may have chosen on purpose, and should know of: a part of the sensor, a limited link."""
     said: list[str] = []
     with suppress(Exception):  # only for information: one that can't be read isn't told
@@ -246,6 +204,6 @@ def told(camera: str, features: Overruled) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _is_limited(features: Overruled) -> bool:
+def _is_limited(features: Features) -> bool:
     mode = "DeviceLinkThroughputLimitMode"
     return not features.has(mode) or features.text(mode) == "On"
