@@ -98,7 +98,7 @@ class SecondLook:
     frames: Annotated[tuple[Frame, ...], Frames("Code of the second look")] = ()
     exposure_ms: Annotated[float, Value("Exposure of the looks", unit="ms")] = float("nan")
     left_out: Annotated[int, Value("Looks left out for want of time")] = 0
-    whole_s: Annotated[float, Value("Time of all looks", unit="s")] = float("nan")
+    whole_s: Annotated[float, Value("Expected time of all looks", unit="s")] = float("nan")
     """Expected, those left out included."""
 
 
